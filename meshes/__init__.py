@@ -1,0 +1,1 @@
+"""Bodies: shapes, surfaces made solid, files, embedding, point clouds, measures of error."""

@@ -1,0 +1,1 @@
+"""The reference: hyperelastic equilibria, eigenmodes, loads, adjoints, data sets (FEniCSx)."""

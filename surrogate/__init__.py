@@ -1,0 +1,1 @@
+"""Learned forward models: architectures, training, validation, prediction (torch)."""
