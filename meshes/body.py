@@ -239,7 +239,7 @@ def _check_cells(points: Floats, cells: Ints) -> None:
             f"first {bad[:5]}; a mesh whose cells are all inverted has another node order."
         )
     edges = coo_array(
-        (np.ones(cells.size, dtype=np.int8), (np.repeat(cells[:, 0], cells.shape[1]), cells.ravel())),
+        (np.ones(cells.size), (np.repeat(cells[:, 0], cells.shape[1]), cells.ravel())),
         shape=(len(points), len(points)),
     )
     count, labels = connected_components(edges, directed=False)

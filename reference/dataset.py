@@ -1,0 +1,316 @@
+"""Data sets of equilibria: Zarr 3 on disk, one chunk a block of samples, written whole or not at all (no FEniCSx here)."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from softtwin.meshes.body import Body, Surface
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Split = Literal["train", "validation", "test"]
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+FORMAT = 1
+
+# Why a draw was kept or kept apart; the numbers are what is stored.
+REASONS = {0: "accepted", 1: "not converged", 2: "unstable equilibrium", 3: "displacement beyond the wanted range"}
+
+
+class DataSetError(ValueError):
+    """A data set that cannot be used: missing, truncated, of another format or another body."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearResponse:
+    """The displacement at rest's tangent, K(0)^-1 b, as a product of two matrices.
+
+    Args:
+        loaded: nodes that may carry force, (l,).
+        left: (3n, r), m.
+        right: (r, 3l), 1/N; the identity where the response is kept exactly.
+    """
+
+    loaded: Ints
+    left: Floats
+    right: Floats
+
+    def apply(self, forces: Floats) -> Floats:
+        """Linear displacements (s, n, 3) for forces at the loaded nodes (s, l, 3)."""
+        flat = forces.reshape(len(forces), -1)
+        return (flat @ self.right.T @ self.left.T).reshape(len(forces), -1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Accepted samples of one split.
+
+    Args:
+        draws: number of each draw in the data set, (s,).
+        forces: at the loaded nodes, (s, l, 3), newtons.
+        displacements: (s, n, 3), metres.
+        probes: cotangents that the adjoints belong to, as coefficients of the modes, (s, k), dimensionless.
+        adjoints: K(u)^-1 g at the loaded nodes for the cotangent g = boundary mask * (Phi probe), (s, l, 3), m/N.
+    """
+
+    draws: Ints
+    forces: Floats
+    displacements: Floats
+    probes: Floats
+    adjoints: Floats
+
+    def __len__(self) -> int:
+        return len(self.draws)
+
+
+@dataclass(frozen=True, eq=False)
+class Rejected:
+    """Draws that were not accepted, with what is known of them: number (s,), forces (s, l, 3), reason in words (s,)."""
+
+    draws: Ints
+    forces: Floats
+    reasons: tuple[str, ...]
+
+
+class DataSet:
+    """A data set opened for reading.
+
+    Args:
+        path: folder of the Zarr store.
+
+    Raises:
+        DataSetError: no data set there, or one of another format.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        if not (self.path / "zarr.json").exists():
+            raise DataSetError(f"DataSet: expected a Zarr 3 data set in {self.path}, found none; make one with `softtwin generate`.")
+        try:
+            self._root = zarr.open_group(str(self.path), mode="r")
+            self.header: dict[str, Any] = json.loads(str(self._root.attrs["header"]))
+        except (KeyError, ValueError, OSError) as error:
+            raise DataSetError(f"DataSet: {self.path} cannot be read ({error}); is the folder truncated?") from error
+        if self.header.get("format") != FORMAT:
+            raise DataSetError(f"DataSet: expected format {FORMAT}, got {self.header.get('format')} in {self.path}.")
+
+    @cached_property
+    def body(self) -> Body:
+        """The body that all samples belong to."""
+        group = self._root["body"]
+        names = self.header["body"]
+        body = Body(
+            points=group["points"][:],
+            cells=group["cells"][:],
+            node_sets={name: group[f"sets/{name}"][:] for name in names["sets"]},
+            surfaces={name: group[f"surfaces/{name}"][:] for name in names["surfaces"]},
+            inner={
+                name: Surface(group[f"inner/{name}/points"][:], group[f"inner/{name}/triangles"][:])
+                for name in names["inner"]
+            },
+        )
+        if body.fingerprint != names["fingerprint"]:
+            raise DataSetError(f"DataSet: the body in {self.path} differs from the one it was made with; is it damaged?")
+        return body
+
+    @cached_property
+    def response(self) -> LinearResponse:
+        """The linear response that surrogates add their correction to."""
+        group = self._root["response"]
+        return LinearResponse(group["loaded"][:], group["left"][:], group["right"][:])
+
+    @cached_property
+    def shapes(self) -> Floats:
+        """Mode shapes, (k, n, 3)."""
+        return self._root["modes/shapes"][:]
+
+    @cached_property
+    def eigenvalues(self) -> Floats:
+        """Eigenvalues of the modes, (k,), N/m."""
+        return self._root["modes/eigenvalues"][:]
+
+    @property
+    def block_count(self) -> int:
+        """Number of blocks when complete."""
+        return int(self._root["samples/checksum"].shape[0])
+
+    def missing_blocks(self) -> list[int]:
+        """Numbers of the blocks that are still to be made."""
+        return np.flatnonzero(self._root["samples/checksum"][:] == 0).tolist()
+
+    def split_draws(self, split: Split) -> range:
+        """Numbers of the draws of a split; splits share no block."""
+        first = 0
+        for name in SPLITS:
+            count = self.header["samples"][name]
+            if name == split:
+                return range(first, first + count)
+            first += -(-count // self.header["block"]) * self.header["block"]
+        raise DataSetError(f"DataSet.split: expected one of {SPLITS}, got {split!r}.")
+
+    def samples(self, split: Split, limit: int | None = None) -> Samples:
+        """The accepted samples of a split, checked against their checksums.
+
+        Args:
+            split: `train`, `validation` or `test`.
+            limit: take the first so many draws only.
+
+        Raises:
+            DataSetError: blocks are missing or damaged.
+        """
+        draws = self.split_draws(split)[:limit]
+        self._check_blocks(draws)
+        group = self._root["samples"]
+        part = slice(draws.start, draws.stop)
+        kept = group["reason"][part] == 0
+        return Samples(
+            draws=np.arange(draws.start, draws.stop)[kept],
+            **{name: group[name][part][kept] for name in ("forces", "displacements", "probes", "adjoints")},
+        )
+
+    def rejected(self) -> Rejected:
+        """All draws of all splits that were kept apart."""
+        group = self._root["samples"]
+        used = np.concatenate([np.asarray(self.split_draws(split), dtype=np.int64) for split in SPLITS])
+        reasons = group["reason"][:]
+        draws = used[reasons[used] > 0]
+        forces = group["forces"]
+        stacked = np.stack([forces[int(i)] for i in draws]) if len(draws) else np.empty((0, *forces.shape[1:]))
+        return Rejected(draws, stacked, tuple(REASONS[int(reasons[i])] for i in draws))
+
+    def figures(self, split: Split) -> dict[str, NDArray[Any]]:
+        """What the solver said of each draw of a split: energy, residual, iterations, load steps, pivots, reason."""
+        draws = self.split_draws(split)
+        group = self._root["samples"]
+        names = ("energy", "residual", "iterations", "load_steps", "negative_pivots", "reason")
+        return {name: group[name][draws.start : draws.stop] for name in names}
+
+    def _check_blocks(self, draws: range) -> None:
+        size = self.header["block"]
+        group = self._root["samples"]
+        stored = group["checksum"][:]
+        for block in range(draws.start // size, -(-draws.stop // size)):
+            if stored[block] == 0:
+                raise DataSetError(
+                    f"DataSet: block {block} of {len(stored)} in {self.path} was never finished; "
+                    "run `softtwin generate` again with the same configuration, it goes on where it stopped."
+                )
+            part = slice(block * size, (block + 1) * size)
+            try:
+                arrays = {name: group[name][part] for name in _BLOCK_ARRAYS}
+            except Exception as error:  # a damaged chunk fails in whichever codec reads it
+                raise DataSetError(f"DataSet: block {block} in {self.path} is damaged ({error}).") from error
+            if checksum(arrays) != stored[block]:
+                raise DataSetError(
+                    f"DataSet: block {block} in {self.path} does not match its checksum: truncated or changed. "
+                    f"Delete it with `softtwin generate --redo {block}` and it is made again."
+                )
+
+
+_BLOCK_ARRAYS = (
+    "forces",
+    "displacements",
+    "probes",
+    "adjoints",
+    "energy",
+    "residual",
+    "iterations",
+    "load_steps",
+    "negative_pivots",
+    "reason",
+)
+
+
+def checksum(arrays: Mapping[str, NDArray[Any]]) -> int:
+    """CRC-32 of the arrays of a block, never 0 (0 stands for a block that is not there)."""
+    value = 0
+    for name in _BLOCK_ARRAYS:
+        value = zlib.crc32(np.ascontiguousarray(arrays[name]).tobytes(), value)
+    return value or 1
+
+
+def create(
+    path: Path, header: dict[str, Any], body: Body, response: LinearResponse, shapes: Floats, eigenvalues: Floats
+) -> DataSet:
+    """Make an empty data set.
+
+    Args:
+        path: folder to make.
+        header: configuration, seed, versions; must hold `block` and `samples` with the count of each split.
+        body: the body.
+        response: its linear response.
+        shapes: mode shapes, (k, n, 3).
+        eigenvalues: of the modes, (k,), N/m.
+    """
+    names = {
+        "sets": sorted(body.node_sets),
+        "surfaces": sorted(body.surfaces),
+        "inner": sorted(body.inner),
+        "fingerprint": body.fingerprint,
+    }
+    root = zarr.create_group(str(path), zarr_format=3, overwrite=True)
+    arrays = {"body/points": body.points, "body/cells": body.cells}
+    arrays |= {f"body/sets/{name}": nodes for name, nodes in body.node_sets.items()}
+    arrays |= {f"body/surfaces/{name}": triangles for name, triangles in body.surfaces.items()}
+    for name, surface in body.inner.items():
+        arrays |= {f"body/inner/{name}/points": surface.points, f"body/inner/{name}/triangles": surface.triangles}
+    arrays |= {"response/loaded": response.loaded, "response/left": response.left, "response/right": response.right}
+    arrays |= {"modes/shapes": shapes, "modes/eigenvalues": eigenvalues}
+    for name, values in arrays.items():
+        root.create_array(name, data=np.ascontiguousarray(values))
+    _create_samples(root, header, len(response.loaded), len(body.points), len(shapes))
+    # The header comes last: a data set without one was never finished being made.
+    root.attrs["header"] = json.dumps({**header, "format": FORMAT, "body": names})
+    return DataSet(path)
+
+
+def _create_samples(root: zarr.Group, header: dict[str, Any], loaded: int, nodes: int, modes: int) -> None:
+    block = header["block"]
+    blocks = sum(-(-header["samples"][split] // block) for split in SPLITS)
+    shapes: dict[str, tuple[tuple[int, ...], str]] = {
+        "forces": ((loaded, 3), "f8"),
+        "displacements": ((nodes, 3), "f8"),
+        "probes": ((modes,), "f8"),
+        "adjoints": ((loaded, 3), "f8"),
+        "energy": ((), "f8"),
+        "residual": ((), "f8"),
+        "iterations": ((), "i4"),
+        "load_steps": ((), "i4"),
+        "negative_pivots": ((), "i4"),
+        "reason": ((), "u1"),
+    }
+    for name, (shape, dtype) in shapes.items():
+        root.create_array(
+            f"samples/{name}", shape=(blocks * block, *shape), chunks=(block, *shape), dtype=dtype, fill_value=0
+        )
+    root.create_array("samples/checksum", shape=(blocks,), chunks=(1,), dtype="u4", fill_value=0)
+
+
+def write_block(path: Path, block: int, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write one block; its checksum comes last, so that a block cut short counts as missing.
+
+    Args:
+        path: folder of the data set.
+        block: number of the block.
+        arrays: one entry for every array of a block, first axis the block size.
+    """
+    group = zarr.open_group(str(path), mode="r+")["samples"]
+    size = len(arrays["reason"])
+    part = slice(block * size, (block + 1) * size)
+    for name in _BLOCK_ARRAYS:
+        group[name][part] = arrays[name]
+    group["checksum"][block] = checksum(arrays)
+
+
+def drop_block(path: Path, block: int) -> None:
+    """Mark a block as missing, so that it is made again."""
+    zarr.open_group(str(path), mode="r+")["samples/checksum"][block] = 0

@@ -1,0 +1,335 @@
+"""Many equilibria over MPI: a task farm in which block b depends on the configuration, the seed and b alone."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import mpi4py
+import numpy as np
+import scipy
+import zarr
+from mpi4py.futures import MPICommExecutor
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from softtwin.meshes.body import Body
+
+from .dataset import SPLITS, DataSet, DataSetError, LinearResponse, create, write_block
+from .equilibrium import NewtonOptions, NotConverged, Problem
+from .fenicsx import MPI, PETSc, dolfinx
+from .loads import LoadPlan, draw_load, loaded_nodes
+from .materials import MATERIALS, Material
+from .modes import eigenmodes
+
+Floats = NDArray[np.float64]
+
+_EXACT_COLUMNS = 1500  # up to so many loaded unknowns the linear response is kept whole
+_RANK = 512  # else its best approximation of this rank: 0.04 % of the displacement on the beam
+_PILOTS = 12
+_QUANTILE = 0.9  # of the pilots' largest displacements that meets the top of the wanted range
+_BEYOND = 2.0  # draws that move more than twice the wanted top are kept apart
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to generate: enough, with a body, to make a data set again.
+
+    Args:
+        material: name of the strain energy, `neo-hookean` or `saint-venant-kirchhoff`.
+        young_modulus: pascals.
+        poisson_ratio: in (0, 0.5).
+        loads: how loads are drawn.
+        samples: draws of each split.
+        block: draws of one block, the unit of work and of storage.
+        seed: seed of everything random.
+        newton: options of the solver.
+    """
+
+    material: str = "neo-hookean"
+    young_modulus: float = 5000.0
+    poisson_ratio: float = 0.45
+    loads: LoadPlan = field(default_factory=LoadPlan)
+    samples: Mapping[str, int] = field(default_factory=lambda: {"train": 256, "validation": 32, "test": 64})
+    block: int = 16
+    seed: int = 0
+    newton: NewtonOptions = field(default_factory=NewtonOptions)
+
+    def __post_init__(self) -> None:
+        if self.material not in MATERIALS:
+            raise ValueError(f"Plan.material: expected one of {sorted(MATERIALS)}, got {self.material!r}.")
+        if set(self.samples) != set(SPLITS) or min(self.samples.values()) < 1:
+            raise ValueError(f"Plan.samples: expected at least one draw for each of {SPLITS}, got {dict(self.samples)}.")
+        if self.block < 1:
+            raise ValueError(f"Plan.block: expected at least 1, got {self.block}.")
+        self.build_material()
+
+    def build_material(self) -> Material:
+        """The strain energy."""
+        return MATERIALS[self.material](self.young_modulus, self.poisson_ratio)
+
+
+def plan_from_header(header: Mapping[str, Any]) -> Plan:
+    """The plan that a data set was made with."""
+    stored = dict(header["plan"])
+    loads = {**stored["loads"], "zones": tuple(stored["loads"]["zones"]), "radius": tuple(stored["loads"]["radius"])}
+    return Plan(**{**stored, "loads": LoadPlan(**loads), "newton": NewtonOptions(**stored["newton"])})
+
+
+def generate(path: Path | str, body: Body, plan: Plan, comm: Any = MPI.COMM_WORLD) -> DataSet | None:
+    """Make a data set, or go on with one that was interrupted; collective over the communicator.
+
+    With one rank the blocks are solved one after the other. With more, rank 0 hands blocks out by `mpi4py.futures`
+    and solves blocks itself meanwhile. The data do not depend on the number of ranks.
+
+    Args:
+        path: folder of the data set.
+        body: the body.
+        plan: what to generate.
+        comm: the ranks that share the work.
+
+    Returns:
+        The data set on rank 0, None on the others.
+
+    Raises:
+        DataSetError: there is a data set of another plan or body at the path.
+    """
+    path = Path(path)
+    if comm.rank == 0:
+        _prepare(path, body, plan)
+    comm.Barrier()
+    if comm.size == 1:
+        _solve_here(path, DataSet(path).missing_blocks())
+    else:
+        with MPICommExecutor(comm, root=0) as pool:
+            if pool is not None:
+                _farm(pool, path, DataSet(path).missing_blocks(), workers=comm.size - 1)
+    return DataSet(path) if comm.rank == 0 else None
+
+
+def _prepare(path: Path, body: Body, plan: Plan) -> None:
+    description = _plain(plan)
+    if (path / "zarr.json").exists():
+        try:
+            present = DataSet(path)
+        except DataSetError:
+            present = None  # interrupted before its header was written
+        if present is not None:
+            _check_same(present, body, description)
+            return
+    with Problem(body, plan.build_material(), plan.newton) as problem:
+        modes = eigenmodes(problem, plan.loads.modes)
+        response = linear_response(problem, loaded_nodes(body, plan.loads), plan.seed)
+        amplitude = plan.loads.amplitude or _calibrate(problem, response, modes.shapes, plan)
+    header = {
+        "plan": description,
+        "block": plan.block,
+        "samples": dict(plan.samples),
+        "amplitude": amplitude,
+        "versions": versions(),
+    }
+    create(path, header, body, response, modes.shapes, modes.eigenvalues)
+
+
+def _plain(plan: Plan) -> dict[str, Any]:
+    description = asdict(plan)
+    description["loads"]["zones"] = list(plan.loads.zones)
+    description["loads"]["radius"] = list(plan.loads.radius)
+    description["samples"] = dict(plan.samples)
+    return description
+
+
+def _check_same(present: DataSet, body: Body, description: dict[str, Any]) -> None:
+    if present.body.fingerprint != body.fingerprint:
+        raise DataSetError(f"generate.path: {present.path} holds a data set of another body; choose another folder.")
+    stored = present.header["plan"]
+    differing = [key for key in description if stored.get(key) != description[key]]
+    if differing:
+        raise DataSetError(
+            f"generate.path: {present.path} was made with another plan (differs in {differing}); "
+            "choose another folder, or the configuration it was made with to go on."
+        )
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the figures of a data set depend on."""
+    return {
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "dolfinx": dolfinx.__version__,
+        "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
+        "mpi4py": mpi4py.__version__,
+        "zarr": zarr.__version__,
+    }
+
+
+def linear_response(problem: Problem, loaded: NDArray[np.int64], seed: int = 0) -> LinearResponse:
+    """K(0)^-1 for forces at the loaded nodes: whole if small, else of rank 512 by a randomised range finder.
+
+    Source of the range finder: Halko, Martinsson, Tropp, SIAM Review 53 (2011), algorithm 4.4.
+
+    Args:
+        problem: body and material.
+        loaded: numbers of the nodes that may carry force, (l,).
+        seed: seed of the random probes.
+    """
+    unknowns = (3 * loaded[:, None] + np.arange(3)).ravel()
+    total = 3 * len(problem.body.points)
+    if len(unknowns) <= _EXACT_COLUMNS:
+        columns = np.zeros((total, len(unknowns)))
+        columns[unknowns, np.arange(len(unknowns))] = 1.0
+        return LinearResponse(loaded, problem.apply_inverse(columns), np.eye(len(unknowns)))
+    probes = np.zeros((total, min(_RANK, len(unknowns))))
+    probes[unknowns] = np.random.default_rng(seed).standard_normal((len(unknowns), probes.shape[1]))
+    for _ in range(2):  # one power iteration sharpens the range
+        basis, _ = np.linalg.qr(problem.apply_inverse(probes))
+        back = problem.apply_inverse(basis)[unknowns]
+        probes = np.zeros_like(probes)
+        probes[unknowns], _ = np.linalg.qr(back)
+    return LinearResponse(loaded, basis, back.T)
+
+
+def _calibrate(problem: Problem, response: LinearResponse, shapes: Floats, plan: Plan) -> float:
+    """The linear displacement for which nine tenths of the pilot loads stay within the wanted range, metres."""
+    units = []
+    for i in range(_PILOTS):
+        rng = np.random.default_rng([plan.seed, 1, i])
+        load = draw_load(problem.body, shapes, plan.loads, rng)
+        units.append(load / _peak(response.apply(load[None, response.loaded])[0]))
+    scale = plan.loads.displacement
+    for _ in tqdm(range(4), desc="calibrating the loads", unit="round", disable=None):
+        reached = np.quantile([_reach(problem, scale * unit, plan) for unit in units], _QUANTILE)
+        scale *= float(np.clip(plan.loads.displacement / reached, 0.3, 3.0))
+    return scale
+
+
+def _reach(problem: Problem, load: Floats, plan: Plan) -> float:
+    try:
+        return _peak(problem.solve(load, stability=False).displacement)
+    except NotConverged:
+        return _BEYOND * plan.loads.displacement
+
+
+def _peak(displacement: Floats) -> float:
+    return float(np.linalg.norm(displacement, axis=1).max())
+
+
+# ------------------------------------------------------------------ the farm
+
+
+def _solve_here(path: Path, blocks: list[int]) -> None:
+    for block in tqdm(blocks, desc="solving", unit="block", disable=None):
+        solve_block(str(path), block)
+
+
+def _farm(pool: MPICommExecutor, path: Path, blocks: list[int], workers: int) -> None:
+    """Keep two blocks with every worker, and solve one here whenever they are all busy."""
+    waiting = iter(blocks)
+    busy: set[Future[int]] = set()
+    with tqdm(total=len(blocks), desc="solving", unit="block", disable=None) as bar:
+        while True:
+            for block in _take(waiting, 2 * workers - len(busy)):
+                busy.add(pool.submit(solve_block, str(path), block))
+            own = next(waiting, None)
+            if own is not None:
+                solve_block(str(path), own)
+                bar.update()
+            done, busy = wait(busy, timeout=0 if own is not None else None, return_when=FIRST_COMPLETED)
+            for future in done:
+                future.result()
+                bar.update()
+            if own is None and not busy:
+                return
+
+
+def _take(source: Iterator[int], count: int) -> Iterator[int]:
+    for _ in range(count):
+        item = next(source, None)
+        if item is None:
+            return
+        yield item
+
+
+@lru_cache(maxsize=1)
+def _opened(path: str) -> tuple[DataSet, Plan, Problem]:
+    data = DataSet(path)
+    plan = plan_from_header(data.header)
+    return data, plan, Problem(data.body, plan.build_material(), plan.newton)
+
+
+def solve_block(path: str, block: int) -> int:
+    """Draw, solve and write one block of a prepared data set; returns its number.
+
+    Args:
+        path: folder of the data set.
+        block: number of the block.
+    """
+    data, plan, problem = _opened(path)
+    rows = [_solve_draw(data, plan, problem, block * plan.block + i) for i in range(plan.block)]
+    write_block(Path(path), block, {name: np.stack([row[name] for row in rows]) for name in rows[0]})
+    return block
+
+
+def scaled_load(data: DataSet, plan: Plan, rng: np.random.Generator) -> Floats:
+    """One load of a data set, (n, 3), newtons: of fixed amplitude, or scaled to a linear displacement in the range."""
+    load = draw_load(data.body, data.shapes, plan.loads, rng)
+    if plan.loads.amplitude is not None:
+        return plan.loads.amplitude * load
+    wanted = rng.uniform(0.0, data.header["amplitude"])
+    return wanted * load / _peak(data.response.apply(load[None, data.response.loaded])[0])
+
+
+def probe_cotangent(body: Body, shapes: Floats, probe: Floats) -> Floats:
+    """The cotangent that a probe stands for, (n, 3): modes on the boundary, as a registration's residual is."""
+    cotangent = np.zeros_like(body.points)
+    nodes = body.boundary_nodes
+    cotangent[nodes] = np.einsum("k,kni->ni", probe, shapes[:, nodes])
+    return cotangent
+
+
+def _solve_draw(data: DataSet, plan: Plan, problem: Problem, draw: int) -> dict[str, NDArray[Any]]:
+    rng = np.random.default_rng([plan.seed, 2, draw])
+    load = scaled_load(data, plan, rng)
+    probe = rng.standard_normal(len(data.shapes))
+    loaded = data.response.loaded
+    row = {
+        "forces": load[loaded],
+        "displacements": np.zeros_like(load),
+        "probes": probe,
+        "adjoints": np.zeros((len(loaded), 3)),
+        "energy": np.float64(0.0),
+        "residual": np.float64(0.0),
+        "iterations": np.int32(0),
+        "load_steps": np.int32(0),
+        "negative_pivots": np.int32(0),
+        "reason": np.uint8(1),
+    }
+    try:
+        state = problem.solve(load)
+    except NotConverged:
+        return row
+    cotangent = probe_cotangent(data.body, data.shapes, probe)
+    adjoint = problem.apply_inverse(cotangent.ravel(), state.displacement).reshape(-1, 3)
+    return row | {
+        "displacements": state.displacement,
+        "adjoints": adjoint[loaded],
+        "energy": np.float64(state.energy),
+        "residual": np.float64(state.residual),
+        "iterations": np.int32(state.iterations),
+        "load_steps": np.int32(state.load_steps),
+        "negative_pivots": np.int32(state.negative_pivots or 0),
+        "reason": np.uint8(_judge(state.displacement, state.negative_pivots or 0, plan)),
+    }
+
+
+def _judge(displacement: Floats, negative_pivots: int, plan: Plan) -> int:
+    if negative_pivots > 0:
+        return 2
+    scaled = plan.loads.amplitude is None
+    return 3 if scaled and _peak(displacement) > _BEYOND * plan.loads.displacement else 0

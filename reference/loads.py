@@ -1,0 +1,93 @@
+"""Samplers of nodal forces: modal loads on surface patches, and the brute-force random loads they are compared with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softtwin.meshes.body import Body
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class LoadPlan:
+    """How loads are drawn.
+
+    Args:
+        kind: `modal` for b = mask * (Phi q) (Odot 2023, eq. 4.5), `random` for an independent force at every node.
+        modes: modes that make the loads, q in [-1, 1]^modes.
+        zones: names of node sets that may carry force; one is drawn for each patch. Empty: the whole free boundary.
+        patches: most patches that act at once; 1..patches are drawn.
+        radius: smallest and largest radius of a patch, relative to the size of its zone.
+        displacement: largest nodal displacement wanted, metres: the top of the range that the loads are scaled to.
+        amplitude: force that multiplies a load, newtons; given, it replaces the scaling to a displacement.
+    """
+
+    kind: Literal["modal", "random"] = "modal"
+    modes: int = 10
+    zones: tuple[str, ...] = ()
+    patches: int = 1
+    radius: tuple[float, float] = (0.06, 0.65)
+    displacement: float = 0.05
+    amplitude: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("modal", "random"):
+            raise ValueError(f"LoadPlan.kind: expected 'modal' or 'random', got {self.kind!r}.")
+        if self.modes < 1 or self.patches < 1:
+            raise ValueError(f"LoadPlan: expected at least one mode and one patch, got {self.modes}, {self.patches}.")
+        if not 0.0 < self.radius[0] <= self.radius[1]:
+            raise ValueError(f"LoadPlan.radius: expected 0 < smallest <= largest, got {self.radius}.")
+        if not self.displacement > 0.0:
+            raise ValueError(f"LoadPlan.displacement: expected a positive length in metres, got {self.displacement}.")
+
+
+def loaded_nodes(body: Body, plan: LoadPlan) -> Ints:
+    """Numbers of the nodes that may carry force, sorted: the free boundary nodes of the zones."""
+    allowed = np.setdiff1d(body.boundary_nodes, body.fixed)
+    if not plan.zones:
+        return allowed
+    missing = [name for name in plan.zones if name not in body.node_sets]
+    if missing:
+        raise ValueError(f"LoadPlan.zones: expected names among {sorted(body.node_sets)}, got {missing}.")
+    zones = np.unique(np.concatenate([body.node_sets[name] for name in plan.zones]))
+    nodes = np.intersect1d(zones, allowed)
+    if len(nodes) == 0:
+        raise ValueError(f"LoadPlan.zones: none of the {len(zones)} nodes of {plan.zones} is on the free boundary.")
+    return nodes
+
+
+def draw_load(body: Body, shapes: Floats, plan: LoadPlan, rng: np.random.Generator) -> Floats:
+    """One unscaled load, (n, 3): the sum of modal (or random) forces on one to `plan.patches` patches.
+
+    Args:
+        body: the body.
+        shapes: mode shapes, (k, n, 3).
+        plan: how loads are drawn.
+        rng: source of chance; the load is a function of it alone.
+    """
+    forces = np.zeros_like(body.points)
+    for _ in range(rng.integers(1, plan.patches + 1)):
+        patch = _draw_patch(body, plan, rng)
+        if plan.kind == "modal":
+            q = rng.uniform(-1.0, 1.0, plan.modes)
+            forces[patch] += np.einsum("k,kni->ni", q, shapes[: plan.modes, patch])
+        else:
+            forces[patch] += rng.uniform(-1.0, 1.0, (len(patch), 3))
+    return forces
+
+
+def _draw_patch(body: Body, plan: LoadPlan, rng: np.random.Generator) -> Ints:
+    """Nodes of a zone in a ball of random centre and radius; never empty, for the centre is a node."""
+    zone = loaded_nodes(body, plan)
+    if plan.zones:
+        zone = np.intersect1d(body.node_sets[plan.zones[rng.integers(len(plan.zones))]], zone)
+    positions = body.points[zone]
+    centre = positions[rng.integers(len(zone))]
+    radius = rng.uniform(*plan.radius) * float(np.linalg.norm(np.ptp(positions, axis=0)))
+    return zone[np.linalg.norm(positions - centre, axis=1) <= radius]
