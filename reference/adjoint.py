@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from softtwin.meshes.body import Body
 
-from .equilibrium import Equilibrium, Problem
+from .equilibrium import Problem
+from .outcome import Equilibrium
 
 Floats = NDArray[np.float64]
 
@@ -51,7 +52,7 @@ class ReferenceModel:
             guess = self._displacement + change.reshape(-1, 3)
             if not np.isfinite(self._problem.energy(guess)):
                 guess = self._displacement
-        result = self._problem.solve(load, guess, stability=False)
+        result = self._problem.solve(load, guess, stability=False, fallback=self.last is None)
         self.last, self._forces, self._displacement = result, load.copy(), result.displacement
         return result.displacement
 

@@ -32,6 +32,7 @@ from .fenicsx import (
     vector_space,
 )
 from .materials import Material
+from .outcome import Equilibrium, NotConverged
 
 Floats = NDArray[np.float64]
 
@@ -64,40 +65,6 @@ class NewtonOptions:
         for name in ("max_iterations", "max_load_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"NewtonOptions.{name}: expected at least 1, got {getattr(self, name)}.")
-
-
-@dataclass(frozen=True, eq=False)
-class Equilibrium:
-    """A state of equilibrium and how it was found.
-
-    Args:
-        displacement: (n, 3), metres, in the body's node order.
-        energy: strain energy minus work of the forces, joules.
-        residual: norm of the out-of-balance nodal forces, newtons.
-        iterations: Newton iterations of all load steps, failed ones included.
-        factorisations: tangents factored for them.
-        load_steps: successful load steps; 1 means that the full load converged at once.
-        reason: why the solver stopped, in words.
-        negative_pivots: negative pivots of the tangent at the state: 0 is a stable state, None was not asked for.
-    """
-
-    displacement: Floats
-    energy: float
-    residual: float
-    iterations: int
-    factorisations: int
-    load_steps: int
-    reason: str
-    negative_pivots: int | None
-
-    @property
-    def is_stable(self) -> bool:
-        """True when the energy has a strict local minimum here; needs the pivots."""
-        return self.negative_pivots == 0
-
-
-class NotConverged(RuntimeError):
-    """No equilibrium was found; the message says how far the load was taken and what to try."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +230,9 @@ class Problem:
 
     # ------------------------------------------------------------------ equilibria
 
-    def solve(self, forces: ArrayLike, guess: ArrayLike | None = None, *, stability: bool = True) -> Equilibrium:
+    def solve(
+        self, forces: ArrayLike, guess: ArrayLike | None = None, *, stability: bool = True, fallback: bool = True
+    ) -> Equilibrium:
         """The displacement that balances nodal forces.
 
         Tries the full load from the guess, then from the warped linear response, then from rest, then in load steps
@@ -273,6 +242,7 @@ class Problem:
             forces: nodal forces, (n, 3), newtons; those at fixed nodes do no work and are ignored.
             guess: displacement to start from, (n, 3), metres; the warped linear response if not given.
             stability: also factor the tangent at the state and count its negative pivots.
+            fallback: try the other ways where the first start fails; without, a failure is raised at once.
 
         Raises:
             ValueError: wrong shape, NaN or infinity.
@@ -288,6 +258,8 @@ class Problem:
             spent += attempt.iterations
             if attempt.converged:
                 return self._result(replace(attempt, iterations=spent), load_steps=1, stability=stability)
+            if not fallback:
+                raise NotConverged(f"Problem.solve: no equilibrium near the guess ({_reason_name(attempt.reason)}).")
         return self._solve_in_steps(load, spent, stability)
 
     def _starts(self, load: Floats, guess: Floats | None) -> Iterator[Floats]:

@@ -5,12 +5,14 @@ It asks for signatures and attributes, never for version numbers.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import inspect
 import logging
 import os
 import platform
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -67,7 +69,9 @@ def quiet_jit() -> Iterator[None]:
     level, handlers, disabled = root.level, list(root.handlers), root.manager.disable
     logging.disable(max(disabled, logging.INFO))
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # FFCx 0.5 uses names that NumPy deprecates and leaves files open
+            yield
     finally:
         logging.disable(disabled)
         root.setLevel(level)
@@ -82,6 +86,21 @@ def _cache_directory() -> Path:
         cpu += next((line for line in info.read_text().splitlines() if line.startswith(("flags", "Features"))), "")
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return base / "softtwin" / f"forms-{dolfinx.__version__}-{hashlib.sha256(cpu.encode()).hexdigest()[:12]}"
+
+
+@contextmanager
+def _compiling(cache: Path) -> Iterator[None]:
+    """One compiling process at a time; what an earlier one left half-made when it was killed is removed.
+
+    FFCx's own lock is a file that survives a kill: every later run would wait for it and fail.
+    """
+    cache.mkdir(parents=True, exist_ok=True)
+    with (cache / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        for source in cache.glob("*.c"):
+            if not source.with_suffix(".c.cached").exists():
+                source.unlink()
+        yield
 
 
 def _element(cell: str) -> Any:
@@ -138,9 +157,10 @@ def constant(domain: Any, value: float) -> Any:
 
 def form(expression: Any) -> Any:
     """Compile a UFL form with optimisation, in a cache of this processor's own."""
-    jit = {"cffi_extra_compile_args": _COMPILE, "cache_dir": _cache_directory(), "timeout": _COMPILE_TIMEOUT_S}
+    cache = _cache_directory()
+    jit = {"cffi_extra_compile_args": _COMPILE, "cache_dir": cache, "timeout": _COMPILE_TIMEOUT_S}
     name = "jit_options" if "jit_options" in inspect.signature(fem.form).parameters else "jit_params"
-    with quiet_jit():
+    with quiet_jit(), _compiling(cache):
         return fem.form(expression, **{name: jit})
 
 

@@ -21,11 +21,12 @@ from tqdm import tqdm
 from softtwin.meshes.body import Body
 
 from .dataset import SPLITS, DataSet, DataSetError, LinearResponse, create, write_block
-from .equilibrium import NewtonOptions, NotConverged, Problem
+from .equilibrium import NewtonOptions, Problem
 from .fenicsx import MPI, PETSc, dolfinx
 from .loads import LoadPlan, draw_load, loaded_nodes
 from .materials import MATERIALS, Material
 from .modes import eigenmodes
+from .outcome import NotConverged
 
 Floats = NDArray[np.float64]
 

@@ -1,0 +1,52 @@
+"""What every benchmark writes beside its table: machine, versions, time, figures, as JSON under results/."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results"
+LIVER = Path(__file__).parents[2] / "shared" / "data" / "liver"
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores and load of this machine, and the versions that figures depend on."""
+    info = Path("/proc/cpuinfo")
+    model = next((line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")), "")
+    names = ("numpy", "scipy", "torch", "vtk", "zarr", "fenics-dolfinx", "petsc4py", "slepc4py")
+    return {
+        "processor": model,
+        "cores": os.cpu_count(),
+        "load_at_the_end": os.getloadavg()[0],
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in names},
+        "threads": os.environ.get("OPENBLAS_NUM_THREADS", "not set"),
+    }
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "absent"
+
+
+def write(name: str, figures: Any) -> Path:
+    """Write the figures of a benchmark; returns the file."""
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{name}.json"
+    record = {"benchmark": name, "date": time.strftime("%Y-%m-%d"), "machine": machine(), "figures": figures}
+    path.write_text(json.dumps(record, indent=1, default=_plain) + "\n")
+    print(f"written: {path.relative_to(RESULTS.parents[1])}")
+    return path
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
