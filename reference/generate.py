@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import platform
+import sys
 from collections.abc import Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass, field
@@ -204,7 +206,7 @@ def _calibrate(problem: Problem, response: LinearResponse, shapes: Floats, plan:
         load = draw_load(problem.body, shapes, plan.loads, rng)
         units.append(load / _peak(response.apply(load[None, response.loaded])[0]))
     scale = plan.loads.displacement
-    for _ in tqdm(range(4), desc="calibrating the loads", unit="round", disable=None):
+    for _ in tqdm(range(4), desc="calibrating the loads", unit="round", disable=_quiet()):
         reached = np.quantile([_reach(problem, scale * unit, plan) for unit in units], _QUANTILE)
         scale *= float(np.clip(plan.loads.displacement / reached, 0.3, 3.0))
     return scale
@@ -225,7 +227,7 @@ def _peak(displacement: Floats) -> float:
 
 
 def _solve_here(path: Path, blocks: list[int]) -> None:
-    for block in tqdm(blocks, desc="solving", unit="block", disable=None):
+    for block in tqdm(blocks, desc="solving", unit="block", disable=_quiet()):
         solve_block(str(path), block)
 
 
@@ -233,7 +235,7 @@ def _farm(pool: MPICommExecutor, path: Path, blocks: list[int], workers: int) ->
     """Keep two blocks with every worker, and solve one here whenever they are all busy."""
     waiting = iter(blocks)
     busy: set[Future[int]] = set()
-    with tqdm(total=len(blocks), desc="solving", unit="block", disable=None) as bar:
+    with tqdm(total=len(blocks), desc="solving", unit="block", disable=_quiet()) as bar:
         while True:
             for block in _take(waiting, 2 * workers - len(busy)):
                 busy.add(pool.submit(solve_block, str(path), block))
@@ -247,6 +249,11 @@ def _farm(pool: MPICommExecutor, path: Path, blocks: list[int], workers: int) ->
                 bar.update()
             if own is None and not busy:
                 return
+
+
+def _quiet() -> bool:
+    """No bar where nobody looks; mpirun hides the terminal, so whoever started it may ask for the bar."""
+    return not (sys.stderr.isatty() or os.environ.get("SOFTTWIN_PROGRESS") == "1")
 
 
 def _take(source: Iterator[int], count: int) -> Iterator[int]:

@@ -258,7 +258,10 @@ def _lbfgs(model: Restricted, registrar: Registrar, cloud: Floats, start: Floats
     best: list[Match] = []
 
     def evaluate(coefficients: Floats) -> tuple[float, Floats]:
-        displacement = registrar.model.solve(control.forces(coefficients))
+        try:
+            displacement = registrar.model.solve(control.forces(coefficients))
+        except NotConverged:  # a wall that the line search steps back from
+            return 10.0 * trace[-1].objective, np.zeros_like(coefficients)
         match = objective.match(displacement[objective.nodes], cloud)
         weight = len(match.distances) / options.noise**2
         pulled = registrar.model.pullback(objective.gradient(match)).ravel() @ control.basis

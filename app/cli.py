@@ -1,0 +1,264 @@
+"""The command line: one command a stage, and the whole chain in one."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from softtwin.meshes.files import UnitWarning
+
+from .config import Config, ConfigError, parse_config, to_toml
+from .register import NOTICE
+
+_PATH = click.Path(path_type=Path)
+_EXISTING = click.Path(exists=True, path_type=Path)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="softtwin")
+def softtwin() -> None:
+    """Turn the surface of a soft organ into a real-time digital twin.
+
+    A reference (FEniCSx) solves hyperelastic equilibria, a surrogate (torch) learns them, and registration finds from
+    a partial point cloud how the whole organ has moved and which forces did it.
+
+    Start with `softtwin quickstart`. For an organ of your own: `softtwin build liver.stl --unit mm --fixed veins.ply`,
+    then `softtwin register twin clouds/*.ply`. Research software: not a medical device.
+    """
+
+
+@softtwin.command()
+def doctor() -> None:
+    """Say what is installed: versions, BLAS, MPI, GPU, compiler, rendering."""
+    from .doctor import as_text, checks
+
+    click.echo(as_text(checks()))
+
+
+@softtwin.command()
+def config() -> None:
+    """Write out the configuration with every default and its meaning (TOML)."""
+    click.echo(to_toml(Config()))
+
+
+@softtwin.command()
+@click.argument("configuration", type=_EXISTING)
+def mesh(configuration: Path) -> None:
+    """Make the body of CONFIGURATION: read or make a surface, fill it with tetrahedra, report the quality."""
+    from .build import mesh_stage, open_workspace
+
+    space = open_workspace(configuration)
+    body = mesh_stage(space)
+    click.echo((space.folder / "mesh_quality.txt").read_text().rstrip())
+    click.echo(f"{len(body.points)} nodes, {len(body.fixed)} of them fixed; written to {space.body}")
+
+
+@softtwin.command()
+@click.argument("configuration", type=_EXISTING)
+@click.option("--redo", multiple=True, type=int, help="Make this block again (may be repeated).")
+def generate(configuration: Path, redo: tuple[int, ...]) -> None:
+    """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped."""
+    from .build import generate_stage, open_workspace
+
+    space = open_workspace(configuration)
+    data = generate_stage(space, redo)
+    if data is not None:
+        click.echo(describe_data(data))
+        click.echo(f"written to {space.data}")
+
+
+def describe_data(data: Any) -> str:
+    """Counts of accepted and rejected draws, with the reasons of the rejected."""
+    rejected = data.rejected()
+    counts = {reason: rejected.reasons.count(reason) for reason in sorted(set(rejected.reasons))}
+    total = sum(data.header["samples"].values())
+    because = f" ({', '.join(f'{count} {reason}' for reason, count in counts.items())})" if counts else ""
+    return f"{total - len(rejected.draws)} equilibria accepted, {len(rejected.draws)} rejected{because}"
+
+
+@softtwin.command()
+@click.argument("configuration", type=_EXISTING)
+@click.option("--fresh", is_flag=True, help="Throw earlier checkpoints away instead of going on from them.")
+def train(configuration: Path, fresh: bool) -> None:
+    """Train the surrogate of CONFIGURATION on its data set and write the twin. Goes on from the last checkpoint."""
+    from .build import open_workspace
+    from .learn import train_stage
+
+    space = open_workspace(configuration)
+    if fresh and space.training.exists():
+        shutil.rmtree(space.training)
+    train_stage(space)
+    click.echo(f"twin written to {space.twin}")
+
+
+@softtwin.command()
+@click.argument("configuration", type=_EXISTING)
+def validate(configuration: Path) -> None:
+    """Measure the twin's errors on the held-out samples, every definition printed."""
+    from .build import open_workspace
+    from .learn import validate_stage
+
+    click.echo(validate_stage(open_workspace(configuration)))
+
+
+@softtwin.command()
+@click.argument("twin", type=_EXISTING)
+@click.argument("clouds", nargs=-1, required=True, type=_PATH)
+@click.option("--model", type=click.Choice(["surrogate", "reference"]), help="Forward model; the twin's choice if not given.")
+@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the clouds.")
+@click.option("--zone", help="Node set whose nodes may carry force.")
+@click.option("--noise", type=float, help="Expected noise of the clouds, metres.")
+@click.option("--smoothness", type=float, help="Correlation length of neighbouring forces, metres.")
+@click.option("--truth", type=_EXISTING, help="True node positions (frames, n, 3) in .npy, metres, to state errors.")
+@click.option("--output", type=_PATH, default=Path("registration"), show_default=True, help="Folder of the results.")
+def register(twin: Path, clouds: tuple[Path, ...], model: str | None, unit: str, truth: Path | None, output: Path, **chosen: Any) -> None:
+    """Register CLOUDS (one file a frame, in order) to TWIN; writes a VTU a frame and registration.json."""
+    from .register import forward_model, make_registrar, open_twin, read_clouds, register_clouds
+
+    body, settings = open_twin(twin)
+    entries = settings.model_dump()
+    entries["registration"] |= {name: value for name, value in chosen.items() if value is not None}
+    settings = parse_config(entries, "command line")
+    frames = read_clouds(clouds, unit, body)
+    positions = None if truth is None else _read_truth(truth, len(frames), len(body.points))
+    with forward_model(model or settings.registration.model, twin, body, settings) as forward:
+        register_clouds(make_registrar(forward, settings, settings.registration), frames, output, positions, click.echo)
+    click.echo(f"{NOTICE}\nwritten to {output}")
+
+
+def _read_truth(path: Path, frames: int, nodes: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    positions = np.load(path)
+    if positions.ndim != 3 or positions.shape[1:] != (nodes, 3) or len(positions) < frames:
+        raise ConfigError(f"--truth: expected shape ({frames} or more, {nodes}, 3), got {positions.shape} in {path}.")
+    return positions
+
+
+@softtwin.command()
+@click.argument("configuration", type=_EXISTING)
+def report(configuration: Path) -> None:
+    """Write the HTML report of what CONFIGURATION's stages have made so far."""
+    from .build import open_workspace
+    from .report import report_stage
+
+    click.echo(f"report written to {report_stage(open_workspace(configuration))}")
+
+
+@softtwin.command()
+@click.argument("surface_or_mesh", type=_PATH)
+@click.option("--fixed", type=_PATH, help="What holds the organ: points or triangles near it, or node numbers (.npy, .txt).")
+@click.option("--fixed-distance", type=float, default=0.0, help="How near to --fixed a node is fixed, metres; 0: one cell.")
+@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the files.")
+@click.option("--observed", type=_PATH, help="The side a camera sees: a surface file, or triangles of node numbers (.npy).")
+@click.option("--zone", "zones", multiple=True, metavar="NAME=FILE", help="Where tools may touch (may be repeated).")
+@click.option("--inner", multiple=True, metavar="NAME=FILE", help="A vessel or tumour surface to carry along.")
+@click.option("--nodes", type=int, default=2000, show_default=True, help="Nodes wanted where a surface is made solid.")
+@click.option("--cell-size", type=float, default=0.0, help="Edge length instead, metres.")
+@click.option("--repair", is_flag=True, help="Mend an open or self-intersecting surface first.")
+@click.option("--law", type=click.Choice(["neo-hookean", "saint-venant-kirchhoff"]), default="neo-hookean", show_default=True)
+@click.option("--young-modulus", type=float, default=5000.0, show_default=True, help="Pascals.")
+@click.option("--poisson-ratio", type=float, default=0.45, show_default=True)
+@click.option("--displacement", type=float, default=0.05, show_default=True, help="Largest displacement to learn, metres.")
+@click.option("--samples", type=int, default=512, show_default=True, help="Equilibria to learn from.")
+@click.option("--seconds", type=float, default=120.0, show_default=True, help="Time to train.")
+@click.option("--ranks", type=int, default=0, help="MPI ranks; 0: one a core.")
+@click.option("--output", type=_PATH, default=Path("twin-run"), show_default=True, help="Folder of everything that is made.")
+def build(surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, **given: Any) -> None:
+    """Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH): mesh, equilibria, surrogate, held-out errors.
+
+    Writes OUTPUT/organ.toml with all settings; run again after an interruption, it goes on where it stopped.
+    """
+    from .chain import build_twin
+
+    body = {
+        "source": str(surface_or_mesh.resolve()),
+        "fixed": str(given["fixed"].resolve()) if given["fixed"] else "",
+        "observed": str(given["observed"].resolve()) if given["observed"] else "",
+        "zones": _named_files("--zone", zones),
+        "inner": _named_files("--inner", inner),
+        **{name: given[name] for name in ("unit", "nodes", "cell_size", "repair", "fixed_distance")},
+    }
+    entries = {
+        "folder": ".",
+        "body": body,
+        "material": {name: given[name] for name in ("law", "young_modulus", "poisson_ratio")},
+        "loads": {"displacement": given["displacement"], "zones": sorted(body["zones"])},
+        "samples": {"train": given["samples"], "validation": max(8, given["samples"] // 8), "test": max(8, given["samples"] // 4), "ranks": given["ranks"]},
+        "training": {"seconds": given["seconds"]},
+    }
+    build_twin(parse_config(entries, "command line"), output, click.echo)
+
+
+def _named_files(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:
+    named = {}
+    for pair in pairs:
+        name, equals, file = pair.partition("=")
+        if not (name and equals and file):
+            raise ConfigError(f"{flag}: expected NAME=FILE, got {pair!r}.")
+        named[name] = str(Path(file).resolve())
+    return named
+
+
+@softtwin.command()
+@click.option("--output", type=_PATH, default=Path("softtwin-quickstart"), show_default=True, help="Folder of everything that is made.")
+@click.option("--small", is_flag=True, help="A coarse organ and few samples: the same path in about a minute, for tests.")
+def quickstart(output: Path, small: bool) -> None:
+    """Run the whole chain on a liver phantom: mesh, modes, equilibria, surrogate, registration, report (minutes)."""
+    from .quickstart import run_quickstart
+
+    run_quickstart(output, small, click.echo)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; errors of the input are one message and exit code 2, not a traceback."""
+    warnings.showwarning = _show_warning
+    try:
+        softtwin.main(args=arguments, standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("\ninterrupted: what was finished is kept; the same command goes on from there.", err=True)
+        sys.exit(130)
+    except ModuleNotFoundError as error:
+        click.echo(f"error: {error}. {_where_from(error.name or '')}", err=True)
+        sys.exit(2)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        click.echo("error: the disk is full. What was written whole is kept; make room and run the same command again.", err=True)
+        sys.exit(2)
+    except (ValueError, RuntimeError) as error:
+        if not _is_ours(error):
+            raise
+        click.echo(f"error: {error}", err=True)
+        sys.exit(2)
+
+
+def _is_ours(error: Exception) -> bool:
+    """Errors whose message is written for the user: raised, with their type or as they are, by this project."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace is not None and str(trace.tb_frame.f_globals.get("__name__", "")).startswith("softtwin.")
+
+
+def _where_from(module: str) -> str:
+    if module.split(".")[0] in ("dolfinx", "petsc4py", "slepc4py", "ufl", "mpi4py", "basix", "ffcx"):
+        return "This stage needs FEniCSx: apt-get install python3-dolfinx-real python3-slepc4py-real."
+    return "Install what is missing: pip install 'softtwin[torch,mesh,app]'; `softtwin doctor` lists everything."
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if issubclass(category, UnitWarning):
+        click.echo(f"warning: {message}", err=True)
+
+
+if __name__ == "__main__":
+    main()

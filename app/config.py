@@ -1,0 +1,175 @@
+"""The configuration file of a twin: TOML, checked, with every default and its meaning written out on demand."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tomlkit
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names every wrong entry, what was expected and what came."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class BodySection(_Section):
+    """Where the body comes from."""
+
+    source: str = Field("liver-phantom", description="a surface or mesh file (STL PLY OBJ VTK VTU VTP MSH), or a shape: liver-phantom, propeller, beam")
+    unit: Literal["m", "cm", "mm"] = Field("m", description="unit of length in the files")
+    cell_size: float = Field(0.0, ge=0.0, description="edge length of the tetrahedra in metres; 0: from nodes")
+    nodes: Count = Field(2000, description="number of nodes wanted where a surface is made solid and cell_size is 0")
+    repair: bool = Field(False, description="mend an open or self-intersecting surface first")
+    fixed: str = Field("", description="what holds the organ: a file of points or triangles near which boundary nodes are fixed, or .npy/.txt of node numbers")
+    fixed_distance: float = Field(0.0, ge=0.0, description="how near, in metres; 0: one cell")
+    observed: str = Field("", description="the side that a camera sees: a surface file or (t, 3) node numbers in .npy; empty: the whole boundary")
+    zones: dict[str, str] = Field(default_factory=dict, description="named zones that tools may touch: files as for fixed")
+    inner: dict[str, str] = Field(default_factory=dict, description="named inner surfaces (vessels, tumours): surface files in the same unit")
+
+
+class MaterialSection(_Section):
+    """The tissue."""
+
+    law: Literal["neo-hookean", "saint-venant-kirchhoff"] = Field("neo-hookean", description="strain energy")
+    young_modulus: Positive = Field(5000.0, description="pascals")
+    poisson_ratio: float = Field(0.45, gt=0.0, lt=0.5, description="between 0 and 0.5; soft tissue 0.45 to 0.49")
+
+
+class LoadsSection(_Section):
+    """The loads that the twin learns from (modes of the stiffness at rest, masked to patches)."""
+
+    kind: Literal["modal", "random"] = Field("modal", description="modal loads, or independent nodal forces to compare with")
+    modes: Count = Field(10, description="eigenmodes that make the loads")
+    patches: Count = Field(2, description="most patches that act at once")
+    radius: tuple[Positive, Positive] = Field((0.06, 0.65), description="smallest and largest patch, relative to its zone")
+    zones: tuple[str, ...] = Field((), description="names of zones that carry the loads; empty: the whole boundary")
+    displacement: Positive = Field(0.05, description="largest displacement wanted, metres; the loads are scaled to it")
+    amplitude: float = Field(0.0, ge=0.0, description="fixed amplitude in newtons instead; 0: scale to the displacement")
+
+
+class SamplesSection(_Section):
+    """How many equilibria."""
+
+    train: Count = Field(512, description="draws to learn from")
+    validation: Count = Field(64, description="draws to choose the best weights with")
+    test: Count = Field(128, description="draws held out, never seen in training")
+    block: Count = Field(8, description="draws in one block of work")
+    seed: int = Field(0, ge=0, description="seed of everything random")
+    ranks: int = Field(0, ge=0, description="MPI ranks that build and quickstart start; 0: one a core")
+
+
+class TrainingSection(_Section):
+    """The surrogate."""
+
+    architecture: Literal["reduced", "mlp"] = Field("reduced", description="reduced network, or the thesis's perceptron as yardstick")
+    modes: Count = Field(64, description="displacement modes (POD) of the reduced network")
+    width: Count = Field(256, description="width of its blocks")
+    seconds: Positive = Field(120.0, description="time to train")
+    seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
+
+
+class RegistrationSection(_Section):
+    """From a cloud to forces."""
+
+    model: Literal["surrogate", "reference"] = Field("surrogate", description="which forward model registers")
+    zone: str = Field("", description="zone whose nodes may carry force; empty: all loaded nodes")
+    noise: Positive = Field(5e-4, description="expected noise of the cloud, metres")
+    force_scale: Positive = Field(0.1, description="expected size of a nodal force, newtons")
+    smoothness: float = Field(0.0, ge=0.0, description="correlation length of neighbouring forces, metres")
+    max_iterations: Count = Field(40, description="iterations for one cloud")
+
+
+class Config(_Section):
+    """One twin, from its surface to its registrations."""
+
+    folder: str = Field("twin-run", description="folder of everything that is made, relative to this file")
+    body: BodySection = BodySection()
+    material: MaterialSection = MaterialSection()
+    loads: LoadsSection = LoadsSection()
+    samples: SamplesSection = SamplesSection()
+    training: TrainingSection = TrainingSection()
+    registration: RegistrationSection = RegistrationSection()
+
+    @model_validator(mode="after")
+    def _radius_is_ordered(self) -> Config:
+        if self.loads.radius[0] > self.loads.radius[1]:
+            raise ValueError(f"loads.radius: expected smallest <= largest, got {self.loads.radius}")
+        return self
+
+
+def read_config(path: Path | str) -> tuple[Config, Path]:
+    """A checked configuration, and the folder that its relative paths start from.
+
+    Args:
+        path: TOML file.
+
+    Raises:
+        ConfigError: the file is missing, no TOML, or entries are unknown or out of range.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ConfigError(f"configuration: expected a TOML file, found none at {path}; `softtwin config` writes one.")
+    try:
+        entries = tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"configuration: {path} is no TOML ({error}).") from error
+    return parse_config(entries, str(path)), path.parent
+
+
+def parse_config(entries: dict[str, Any], source: str = "configuration") -> Config:
+    """A configuration from plain entries.
+
+    Raises:
+        ConfigError: entries are unknown or out of range.
+    """
+    try:
+        return Config.model_validate(entries)
+    except ValidationError as error:
+        lines = [
+            f"  {'.'.join(map(str, item['loc'])) or 'configuration'}: {item['msg']}, got {item['input']!r}"
+            for item in error.errors()
+        ]
+        raise ConfigError("\n".join([f"{source}: {len(lines)} wrong entries", *lines])) from None
+
+
+def to_toml(config: Config) -> str:
+    """The configuration as TOML, each entry with its meaning behind it."""
+    document = tomlkit.document()
+    document.add(tomlkit.comment("softtwin: research software, not a medical device"))
+    for name, field in type(config).model_fields.items():
+        value = getattr(config, name)
+        if not isinstance(value, BaseModel):
+            document.add(name, tomlkit.item(value).comment(field.description or ""))
+    for name in type(config).model_fields:
+        value = getattr(config, name)
+        if isinstance(value, BaseModel):
+            document.add(tomlkit.nl())
+            document.add(name, _table(value))
+    return tomlkit.dumps(document)
+
+
+def _table(section: BaseModel) -> Any:
+    table = tomlkit.table()
+    table.comment((type(section).__doc__ or "").strip())
+    subtables = {}
+    for name, field in type(section).model_fields.items():
+        value = getattr(section, name)
+        if isinstance(value, dict):
+            subtables[name] = value
+            continue
+        item = tomlkit.item(list(value) if isinstance(value, tuple) else value)
+        table.add(name, item.comment(field.description or ""))
+    for name, value in subtables.items():
+        inner = tomlkit.inline_table()
+        inner.update(value)
+        table.add(name, inner.comment(type(section).model_fields[name].description or ""))
+    return table

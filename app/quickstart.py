@@ -1,0 +1,121 @@
+"""The main job on an embedded default: a liver phantom from its shape to registered clouds and a report."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.clouds import partial_view
+from softtwin.meshes.files import read_body
+
+from .build import Workspace, target_points, timed
+from .chain import make_twin, prepare
+from .config import Config, RegistrationSection
+from .register import NOTICE, forward_model, make_registrar, register_clouds
+from .report import report_stage
+
+Floats = NDArray[np.float64]
+_CAMERA = np.array([-0.3, -1.0, 0.25])  # from the organ towards the camera: the phantom's front, a little from above
+_POINTS = 1000
+_NOISE = 5e-4
+
+
+def quickstart_config(small: bool) -> Config:
+    """The configuration of the quickstart; `small` goes the same way with less of everything."""
+    loads = {"displacement": 0.03, "patches": 2, "radius": (0.15, 0.5)}
+    if small:
+        samples = {"train": 24, "validation": 8, "test": 8, "block": 4}
+        body = {"source": "liver-phantom", "cell_size": 0.016}
+        return Config.model_validate({"folder": ".", "body": body, "loads": loads, "samples": samples, "training": {"seconds": 5.0, "modes": 16}})
+    samples = {"train": 256, "validation": 32, "test": 48}
+    body = {"source": "liver-phantom", "cell_size": 0.0105}
+    return Config.model_validate({"folder": ".", "body": body, "loads": loads, "samples": samples, "training": {"seconds": 60.0}})
+
+
+def run_quickstart(output: Path, small: bool, say: Callable[[str], None]) -> Path:
+    """The whole chain; returns the report.
+
+    Args:
+        output: folder of everything that is made; a finished stage in it is not made again.
+        small: a coarse organ and few samples.
+        say: prints a line.
+    """
+    say(f"softtwin quickstart: a liver phantom becomes a twin in {output}. {NOTICE}")
+    space = prepare(quickstart_config(small), output)
+    make_twin(space, output / "organ.toml", say)
+    say("registration: a partial cloud of an unseen deformation")
+    demo_stage(space, say)
+    say("report: pictures and figures")
+    with timed(space, "report"):
+        path = report_stage(space)
+    say(f"open {path}")
+    return path
+
+
+def demo_stage(space: Workspace, say: Callable[[str], None]) -> None:
+    """Deform the organ by an unseen load, look at it from one side, and register what is seen with both models."""
+    folder = space.folder / "demo"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    body = read_body(space.body)
+    with timed(space, "demo"), forward_model("reference", space.twin, body, space.config) as reference:
+        forces, zone = unseen_load(body, reference, space.config.loads.displacement)
+        reference.reset()
+        truth = reference.solve(forces)
+        cloud = partial_view(body, truth, _CAMERA, _POINTS, _NOISE, np.random.default_rng(11), surface="observed")
+        np.save(folder / "cloud.npy", cloud)
+        np.save(folder / "truth.npy", truth)
+        for name, error in _target_errors(body, np.zeros_like(truth), truth).items():
+            say(f"    before: {name} {1e3 * error:.2f} mm away from where it is")
+        section = RegistrationSection(zone="tool", noise=_NOISE, smoothness=0.02)
+        held = body.with_sets(tool=zone)
+        _register(space, "surrogate", held, section, cloud, truth, forces, say)
+        _register(space, "reference", held, section, cloud, truth, forces, say)
+
+
+def unseen_load(body: Body, model: Any, displacement: float) -> tuple[Floats, NDArray[np.int64]]:
+    """A pull on a patch of the observed side that no training load equals, and the wider zone a tool is known to touch.
+
+    Args:
+        body: the phantom.
+        model: the reference, which scales the load to the displacement.
+        displacement: largest displacement wanted, metres.
+    """
+    seen = np.setdiff1d(np.unique(body.surfaces["observed"]), body.fixed)
+    # The point of the seen side farthest from what holds the organ moves most freely.
+    distance = np.linalg.norm(body.points[seen][:, None] - body.points[body.fixed][None], axis=2).min(axis=1)
+    centre = body.points[seen[np.argmax(distance)]]
+    away = np.linalg.norm(body.points[seen] - centre, axis=1)
+    tool, zone = seen[away < 0.03], seen[away < 0.05]
+    forces = np.zeros_like(body.points)
+    forces[tool] = np.array([0.25, -0.75, 0.6]) / len(tool)
+    for _ in range(4):
+        reached = np.linalg.norm(model.solve(forces), axis=1).max()
+        forces *= 0.8 * displacement / reached
+    return forces, zone
+
+
+def _target_errors(body: Body, displacement: Floats, truth: Floats) -> dict[str, float]:
+    return {
+        name: float(np.linalg.norm(points.displace(displacement - truth), axis=1).mean())
+        for name, points in target_points(body).items()
+    }
+
+
+def _register(
+    space: Workspace, name: str, body: Body, section: RegistrationSection, cloud: Floats, truth: Floats, forces: Floats, say: Callable[[str], None]
+) -> None:
+    folder = space.folder / "demo"
+    with forward_model(name, space.twin, body, space.config) as model:
+        registrar = make_registrar(model, space.config, section)
+        result = register_clouds(registrar, [cloud], folder / name, truth[None] + body.points, lambda line: None)[0]
+    np.savez(folder / f"{name}.npz", displacement=result.displacement, forces=result.forces, true_forces=forces)
+    errors = ", ".join(f"{key} {1e3 * value:.2f} mm" for key, value in _target_errors(body, result.displacement, truth).items())
+    net, true = np.linalg.norm(result.net_force), np.linalg.norm(forces.sum(axis=0))
+    say(f"    after, with the {name}: {errors}; net force {net:.2f} N, true {true:.2f} N; {result.seconds:.2f} s")

@@ -1,0 +1,47 @@
+"""Imports every module that must work without FEniCSx; fails when one does not, or when FEniCSx is there.
+
+python ci/import_fast_path.py                  with the extras torch and mesh
+python ci/import_fast_path.py --without-mesh   with the extra torch alone: meshes may then ask for mesh's packages
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+from importlib.util import find_spec
+
+FENICSX = ("dolfinx", "dolfinx_solver", "ufl", "basix", "ffcx", "petsc4py", "slepc4py")
+MESH_PACKAGES = {"gmsh", "pymeshfix", "trimesh"}
+PACKAGES = ("softtwin.meshes", "softtwin.surrogate", "softtwin.registration")
+SINGLE_MODULES = ("softtwin.reference.dataset",)
+
+
+def modules() -> list[str]:
+    """Names of all modules of the fast path."""
+    found = list(SINGLE_MODULES)
+    for name in PACKAGES:
+        package = importlib.import_module(name)
+        found += [name, *(module.name for module in pkgutil.walk_packages(package.__path__, f"{name}."))]
+    return found
+
+
+def main(without_mesh: bool) -> int:
+    """Prints what could not be imported and how many modules could; 1 when one could not."""
+    failed = [f"{name} can be imported: this environment has FEniCSx" for name in FENICSX if find_spec(name)]
+    names = modules()
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if not (without_mesh and name.startswith("softtwin.meshes") and error.name in MESH_PACKAGES):
+                failed.append(f"{name}: {error}")
+    failed += [f"{name} was imported on the way" for name in FENICSX if name in sys.modules]
+    for line in failed:
+        print(f"error: {line}")
+    print(f"fast path without FEniCSx: {len(names)} modules imported, {len(failed)} problems")
+    return int(bool(failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main("--without-mesh" in sys.argv))

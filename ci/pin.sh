@@ -1,0 +1,39 @@
+#!/usr/bin/env bash
+# Resolves all dependencies anew and writes ci/constraints.txt and, where a Python 3.12 is found, ci/constraints-011.txt.
+# Run it by hand when a dependency is added or is to be renewed; then run ci/test.sh.
+set -euo pipefail
+source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
+cd "$ROOT"
+TEMPORARY=$(mktemp -d)
+trap 'rm -rf "$TEMPORARY"' EXIT
+PINS="$TEMPORARY/pins.txt"
+
+# What is not free: Debian's modules are built for numpy 1.x, and scipy is Debian's own.
+printf '%s\n' torch==2.13.0 numpy==1.26.4 scipy==1.10.1 >"$PINS"
+
+# frozen PYTHON: what pip put there, as pins without local version labels (2.13.0+cpu) and without the project.
+frozen() { "$1" -m pip freeze --all --local --exclude-editable | grep -E "^[A-Za-z0-9._-]+==" | grep -v "^pip==" | sed "s/+.*//"; }
+
+resolve() { # EXTRAS PYTHON_OPTIONS...: adds to the pins what a virtual environment with the extras holds
+    local extras=$1
+    shift
+    rm -rf "$TEMPORARY/venv"
+    "$SYSTEM_PYTHON" -m venv "$@" "$TEMPORARY/venv"
+    "$TEMPORARY/venv/bin/python" -m pip install -q -c "$PINS" --editable ".[$extras]"
+    { cat "$PINS"; frozen "$TEMPORARY/venv/bin/python"; } | sort -fu >"$TEMPORARY/more.txt"
+    mv "$TEMPORARY/more.txt" "$PINS"
+}
+
+write() { # FILE SOURCE PYTHON: the pins under two lines that say what they are
+    { printf '# Exact versions for Python %s. Written by ci/pin.sh.\n' "$3"; cat "$2"; } >"$1"
+    say "$1: $(wc -l <"$2") pins"
+}
+
+resolve torch,mesh,app,dev --system-site-packages
+resolve torch,mesh,app,test
+write ci/constraints.txt "$PINS" 3.11
+if [ -x .venv-011/bin/python ]; then
+    frozen .venv-011/bin/python | sort -f >"$TEMPORARY/second.txt"
+    write ci/constraints-011.txt "$TEMPORARY/second.txt" 3.12
+fi
+rm -rf softtwin.egg-info

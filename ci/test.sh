@@ -1,0 +1,79 @@
+#!/usr/bin/env bash
+# All set-up, then every check and test. All groups run; one line each at the end says what ran, and the exit code is
+# 1 when any failed. Arguments name the groups to run (all by default): format lint types layers tests liver
+# no-fenicsx dolfinx-0.11.
+set -uo pipefail
+source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
+cd "$ROOT"
+bash ci/setup.sh || exit 1
+export PATH="$VENV/bin:$PATH"
+LOGS="$ROOT/build/ci"
+rm -rf "$LOGS" && mkdir -p "$LOGS"
+SKIPPED=77
+TABLE=()
+FAILED=0
+ASKED=("$@")
+
+# group NAME COMMAND...: runs the command and keeps its outcome with the last line it printed; 77 means skipped.
+group() {
+    local name=$1 outcome
+    shift
+    if [ ${#ASKED[@]} != 0 ] && [[ " ${ASKED[*]} " != *" $name "* ]]; then return; fi
+    printf '\n== %s\n' "$name"
+    "$@" 2>&1 | tee "$LOGS/$name.log"
+    case ${PIPESTATUS[0]} in
+        0) outcome=passed ;;
+        "$SKIPPED") outcome=skipped ;;
+        *) outcome=FAILED FAILED=1 ;;
+    esac
+    TABLE+=("$(printf '%-8s %-14s %s' "$outcome" "$name" "$(grep -v '^\s*$' "$LOGS/$name.log" | tail -n 1)")")
+}
+
+format() { ruff format --check .; }
+lint() {
+    local script
+    for script in .ci/run ci/*.sh; do bash -n "$script" || return 1; done
+    ruff check .
+}
+types() { mypy | sed 's#^\.venv/types/softtwin/##'; } # the links' names mean nothing to a reader
+layers() { lint-imports --no-logo; }
+
+# run_tests NAME ARGUMENTS...: pytest, then the count by folder, which fails when a folder that can run was all skipped.
+run_tests() {
+    local name=$1 status
+    shift
+    pytest -o junit_family=xunit1 --junitxml="$LOGS/$name.xml" "$@"
+    status=$?
+    python ci/tally.py "$LOGS/$name.xml" || status=1
+    return $status
+}
+tests() { run_tests tests -m "not liver" tests; }
+liver() {
+    if [ ! -d ../shared/data/liver ]; then
+        echo "skipped: the real liver is not there (../shared/data/liver, seen from the repository's root)"
+        return $SKIPPED
+    fi
+    run_tests liver -m liver tests
+}
+slow() {
+    if [ "${SOFTTWIN_SKIP_SLOW:-0}" = 1 ]; then
+        echo "skipped: SOFTTWIN_SKIP_SLOW=1"
+        return $SKIPPED
+    fi
+    "$@"
+}
+
+group format format
+group lint lint
+group types types
+group layers layers
+group tests tests
+group liver liver
+group no-fenicsx slow bash ci/no-fenicsx.sh "$LOGS/no-fenicsx.xml"
+group dolfinx-0.11 slow bash ci/dolfinx011.sh "$LOGS/dolfinx-0.11.xml"
+
+[ ${#TABLE[@]} != 0 ] || fail "no such group: ${ASKED[*]}"
+printf '\n== what ran\n'
+printf '%s\n' "${TABLE[@]}"
+python ci/tally.py --total "$LOGS"/*.xml
+exit $FAILED

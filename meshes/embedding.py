@@ -1,0 +1,197 @@
+"""Points and inner surfaces carried by a body: each point follows the shape functions of its cell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+from vtkmodules.vtkCommonCore import mutable
+
+from .body import HEXAHEDRON_FACES, TETRAHEDRON_FACES, Body, Floats, Ints, Surface
+from .clouds import cell_locator
+
+# Corners of the reference cube in VTK order.
+_CUBE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], dtype=float)
+_NEWTON_STEPS = 20
+_STEP_TOLERANCE = 1e-13
+_TOLERANCE = 1e-9  # in local coordinates: how far outside a cell a point still counts as inside
+
+
+@dataclass(frozen=True, eq=False)
+class Embedding:
+    """Points tied to a body: the position of a point is the weighted mean of the nodes of its cell.
+
+    Args:
+        cells: number of the cell that carries each point, (p,).
+        nodes: node numbers of these cells, (p, k).
+        weights: weight of each of these nodes, (p, k); they sum to 1.
+        outside: distance of each point to the body, (p,), metres; 0 inside. A point outside moves with the
+            nearest point of the boundary.
+        node_count: number of nodes of the body.
+    """
+
+    cells: Ints
+    nodes: Ints
+    weights: Floats
+    outside: Floats
+    node_count: int
+
+    @cached_property
+    def matrix(self) -> csr_array:
+        """Interpolation matrix, (p, n): nodal values to values at the points."""
+        rows = np.arange(0, self.nodes.size + 1, self.nodes.shape[1])
+        shape = (len(self.nodes), self.node_count)
+        return csr_array((self.weights.ravel(), self.nodes.ravel(), rows), shape=shape)
+
+    def displace(self, displacement: ArrayLike) -> Floats:
+        """Displacements of the points, (p, 3), metres.
+
+        Args:
+            displacement: nodal displacements, (n, 3), metres.
+
+        Raises:
+            ValueError: another shape.
+        """
+        nodal = np.asarray(displacement, dtype=np.float64)
+        if nodal.shape != (self.node_count, 3):
+            raise ValueError(f"displacement: expected shape ({self.node_count}, 3), got {nodal.shape}.")
+        return np.einsum("pk,pki->pi", self.weights, nodal[self.nodes])
+
+
+def embed(body: Body, points: ArrayLike) -> Embedding:
+    """The embedding of points in a body.
+
+    Args:
+        body: the body at rest.
+        points: positions at rest, (p, 3), metres.
+
+    Raises:
+        ValueError: wrong shape or numbers that are not finite.
+    """
+    positions = np.asarray(points, dtype=np.float64)
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise ValueError(f"points: expected shape (p, 3), got {positions.shape}.")
+    if not np.isfinite(positions).all():
+        raise ValueError("points: expected finite coordinates, got NaN or infinity.")
+    positions = positions.copy()
+    cells = _containing_cells(body, positions)
+    outside = np.zeros(len(positions))
+    lost = np.flatnonzero(cells < 0)
+    if len(lost):
+        cells[lost], positions[lost], outside[lost] = _nearest(body, positions[lost])
+    if body.is_tetrahedral:
+        weights = _tetrahedron_weights(body, cells, positions)
+    else:
+        weights = _trilinear(_local_coordinates(body, cells, positions))
+    return Embedding(cells, body.cells[cells], weights, outside, len(body.points))
+
+
+def carried(body: Body, displacement: ArrayLike) -> dict[str, Surface]:
+    """The inner surfaces of a body after its nodes have moved.
+
+    Args:
+        body: the body at rest.
+        displacement: nodal displacements, (n, 3), metres.
+
+    Raises:
+        ValueError: another shape.
+    """
+    return {
+        name: Surface(surface.points + embed(body, surface.points).displace(displacement), surface.triangles)
+        for name, surface in body.inner.items()
+    }
+
+
+def _containing_cells(body: Body, points: Floats) -> Ints:
+    """Number of the cell around each point, -1 where there is none."""
+    cells, numbers = _candidates(body, points)
+    depths = _depths(body, cells, points[numbers])
+    # Of a point's candidates the one in which it lies deepest: sorted last, written last.
+    order = np.argsort(depths, kind="stable")
+    found, depth = np.full(len(points), -1), np.full(len(points), -np.inf)
+    found[numbers[order]] = cells[order]
+    depth[numbers[order]] = depths[order]
+    return np.where(depth >= -_TOLERANCE, found, -1)
+
+
+def _candidates(body: Body, points: Floats) -> tuple[Ints, Ints]:
+    """Pairs of cell number and point number such that the point lies in the cell's bounding box."""
+    corners = body.points[body.cells]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    slack = _TOLERANCE * body.size
+    near = cKDTree(points).query_ball_point((low + high) / 2, np.linalg.norm(high - low, axis=1) / 2 + slack)
+    cells = np.repeat(np.arange(len(body.cells)), [len(found) for found in near])
+    numbers = np.fromiter(chain.from_iterable(near), dtype=np.int64, count=len(cells))
+    boxed = ((points[numbers] >= low[cells] - slack) & (points[numbers] <= high[cells] + slack)).all(axis=1)
+    return cells[boxed], numbers[boxed]
+
+
+def _depths(body: Body, cells: Ints, points: Floats) -> Floats:
+    """Smallest local coordinate of each point in its cell: not negative inside."""
+    if body.is_tetrahedral:
+        return _tetrahedron_weights(body, cells, points).min(axis=1)
+    xi = _local_coordinates(body, cells, points)
+    return np.minimum(xi, 1 - xi).min(axis=1)
+
+
+def _nearest(body: Body, points: Floats) -> tuple[Ints, Floats, Floats]:
+    """Cells at the nearest points of the boundary, these points and their distances."""
+    locator = cell_locator(body.boundary_surface)
+    nearest, triangles = np.empty_like(points), np.empty(len(points), dtype=np.int64)
+    closest = [0.0, 0.0, 0.0]
+    cell: Any = mutable(0)  # VTK writes its answers into these
+    part: Any = mutable(0)
+    square: Any = mutable(0.0)
+    for i, point in enumerate(points):
+        locator.FindClosestPoint(point.tolist(), closest, cell, part, square)
+        nearest[i], triangles[i] = closest, int(cell)
+    distances = np.linalg.norm(points - nearest, axis=1)
+    return _owners(body)[triangles], nearest, distances
+
+
+def _owners(body: Body) -> Ints:
+    """Number of the cell behind each triangle of the boundary."""
+    local = TETRAHEDRON_FACES if body.is_tetrahedral else HEXAHEDRON_FACES
+    faces = body.cells[:, local].reshape(-1, local.shape[1])
+    halves = faces if body.is_tetrahedral else faces[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    per_cell = len(halves) // len(body.cells)
+    known = {tuple(corners): i // per_cell for i, corners in enumerate(halves.tolist())}
+    return np.array([known[tuple(corners)] for corners in body.boundary.tolist()])
+
+
+def _tetrahedron_weights(body: Body, cells: Ints, points: Floats) -> Floats:
+    corners = body.points[body.cells[cells]]
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    last = np.linalg.solve(edges, (points - corners[:, 0])[:, :, None])[:, :, 0]
+    return np.column_stack([1 - last.sum(axis=1), last])
+
+
+def _local_coordinates(body: Body, cells: Ints, points: Floats) -> Floats:
+    """Coordinates in the reference cube, (p, 3), by Newton's method on the trilinear map."""
+    corners = body.points[body.cells[cells]]
+    xi = np.full((len(points), 3), 0.5)
+    for _ in range(_NEWTON_STEPS):
+        gap = points - np.einsum("pk,pki->pi", _trilinear(xi), corners)
+        jacobian = np.einsum("pki,pkj->pij", corners, _trilinear_gradient(xi))
+        step = np.linalg.solve(jacobian, gap[:, :, None])[:, :, 0]
+        xi = np.clip(xi + step, -0.25, 1.25)  # farther out the map may fold over
+        if np.abs(step).max(initial=0.0) < _STEP_TOLERANCE:
+            break
+    return xi
+
+
+def _trilinear(xi: Floats) -> Floats:
+    return np.prod(np.where(_CUBE > 0, xi[:, None, :], 1 - xi[:, None, :]), axis=2)
+
+
+def _trilinear_gradient(xi: Floats) -> Floats:
+    factors = np.where(_CUBE > 0, xi[:, None, :], 1 - xi[:, None, :])
+    signs = 2 * _CUBE - 1
+    x, y, z = (factors[:, :, i] for i in range(3))
+    return np.stack([signs[:, 0] * y * z, signs[:, 1] * x * z, signs[:, 2] * x * y], axis=2)

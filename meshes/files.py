@@ -1,0 +1,448 @@
+"""Files in and out: surfaces, volumes, clouds and bodies, in any unit, always metres inside."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import os
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import quote, unquote
+
+import meshio
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
+from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkPoints, vtkStringOutputWindow
+from vtkmodules.vtkCommonDataModel import VTK_HEXAHEDRON, VTK_TETRA, vtkCellArray, vtkUnstructuredGrid
+from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+from vtkmodules.vtkIOLegacy import vtkDataSetReader
+from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader, vtkXMLUnstructuredGridWriter
+
+from .body import Body, Floats, Ints, Surface, corner_jacobians
+
+Unit = Literal["m", "cm", "mm"]
+Axes = Literal["lps", "ras"]
+
+_log = logging.getLogger(__name__)
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_LARGEST, _SMALLEST = 2.0, 5e-3  # metres: an organ outside these was read in the wrong unit
+_MESHIO = (".stl", ".ply", ".obj", ".msh")
+_VTK: Mapping[str, Any] = {".vtk": vtkDataSetReader, ".vtu": vtkXMLUnstructuredGridReader, ".vtp": vtkXMLPolyDataReader}
+_TEXT = (".txt", ".csv", ".xyz")
+_VTK_CORNERS = {5: ("triangle", 3), 9: ("quad", 4), 10: ("tetra", 4), 12: ("hexahedron", 8)}
+_MARK = "softtwin body"
+_PLAIN = " :()[]/,=+@"
+_PREFIXES = ("node_set:", "surface:", "inner_points:", "inner_triangles:")
+
+
+class FileError(ValueError):
+    """A file that cannot be used: the message names it, what was expected and what came."""
+
+
+class UnitWarning(UserWarning):
+    """A file whose size fits no organ: it was probably read in the wrong unit."""
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    points: Floats
+    cells: Mapping[str, Ints]
+
+    @property
+    def triangles(self) -> Ints:
+        quads = self.cells.get("quad", np.empty((0, 4), np.int64))
+        halves = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+        return np.concatenate([self.cells.get("triangle", np.empty((0, 3), np.int64)), halves])
+
+    @property
+    def content(self) -> str:
+        counts = [f"{len(block)} {name}" for name, block in self.cells.items() if name != "vertex"]
+        return f"{len(self.points)} points" + (f" and cells: {', '.join(counts)}" if counts else " and no cells")
+
+
+def read_mesh(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Surface | tuple[Floats, Ints]:
+    """What a mesh file holds: points and cells where it has tetrahedra or hexahedra, else a surface.
+
+    Args:
+        path: STL, PLY, OBJ, VTK, VTU, VTP or MSH file.
+        unit: the file's unit of length.
+        axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign).
+
+    Raises:
+        FileError: as `read_surface`.
+    """
+    mesh = _read(path)
+    if {"tetra", "hexahedron"} & set(mesh.cells):
+        return _volume(Path(path), mesh, unit, axes)
+    return _surface(Path(path), mesh, unit, axes)
+
+
+def read_surface(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Surface:
+    """The triangles of a file as a surface in metres; quadrilaterals are split, an STL's double vertices merged.
+
+    Args:
+        path: STL, PLY, OBJ, VTK, VTU, VTP or MSH file.
+        unit: the file's unit of length.
+        axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign).
+
+    Raises:
+        FileError: missing, empty, damaged or unknown file, or no triangles in it.
+    """
+    return _surface(Path(path), _read(path), unit, axes)
+
+
+def read_volume(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> tuple[Floats, Ints]:
+    """Points (n, 3) in metres and cells (m, 4) or (m, 8) of a volume mesh, the file's node numbers kept.
+
+    Args:
+        path: VTK, VTU or MSH file with tetrahedra or hexahedra (not both); triangles beside them are ignored.
+        unit: the file's unit of length.
+        axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign).
+
+    Raises:
+        FileError: missing, empty, damaged or unknown file, a surface only, or both kinds of cells.
+    """
+    return _volume(Path(path), _read(path), unit, axes)
+
+
+def read_cloud(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Floats:
+    """The points of a file, (p, 3), metres.
+
+    Args:
+        path: text with three columns (TXT, CSV, XYZ), NPY, or any mesh file whose points are taken.
+        unit: the file's unit of length.
+        axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign).
+
+    Raises:
+        FileError: missing, empty, damaged or unknown file, or not three columns of numbers.
+    """
+    path = _existing(path)
+    points = _read_table(path) if path.suffix.lower() in (*_TEXT, ".npy") else _read(path).points
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise FileError(f"{path}: expected a cloud of shape (p, 3), got {points.shape}.")
+    if len(points) == 0:
+        raise FileError(f"{path}: expected a cloud with points, got none.")
+    return _in_metres(path, points, unit, axes, smallest=0.0)
+
+
+def write_body(path: str | Path, body: Body) -> None:
+    """Write a body to a VTU file that `read_body` reads back bit for bit, and that ParaView shows.
+
+    The file appears whole or not at all.
+
+    Args:
+        path: file to write, `.vtu`.
+        body: the body.
+
+    Raises:
+        FileError: another suffix, or the file could not be written.
+    """
+    grid = _grid(body.points, body.cells)
+    for name, nodes in body.node_sets.items():
+        mask = np.zeros(len(body.points), dtype=np.uint8)
+        mask[nodes] = 1
+        _add(grid.GetPointData(), name, mask)
+        _add(grid.GetFieldData(), f"node_set:{name}", nodes)
+    for name, triangles in body.surfaces.items():
+        _add(grid.GetFieldData(), f"surface:{name}", triangles)
+    for name, surface in body.inner.items():
+        _add(grid.GetFieldData(), f"inner_points:{name}", surface.points)
+        _add(grid.GetFieldData(), f"inner_triangles:{name}", surface.triangles)
+    _add(grid.GetFieldData(), _MARK, np.array([1]))
+    _write(Path(path), grid)
+
+
+def read_body(path: str | Path) -> Body:
+    """The body that `write_body` wrote, bit for bit.
+
+    Args:
+        path: VTU file.
+
+    Raises:
+        FileError: missing or damaged file, or one that `write_body` did not write.
+        BodyError: the file's content is no valid body.
+    """
+    path = _existing(path)
+    if path.suffix.lower() != ".vtu":
+        raise FileError(f"{path}: expected a body as .vtu, got {path.suffix!r}.")
+    grid = _read_vtk(path)
+    fields = grid.GetFieldData()
+    arrays = {fields.GetArrayName(i): fields.GetArray(i) for i in range(fields.GetNumberOfArrays())}
+    if _MARK not in arrays:
+        raise FileError(f"{path}: not a body written by softtwin; read it as a mesh and say which nodes are fixed.")
+    sets, surfaces, points, triangles = (_named(arrays, prefix) for prefix in _PREFIXES)
+    blocks = _grid_blocks(grid)
+    cells = blocks["tetra"] if "tetra" in blocks else blocks["hexahedron"]
+    inner = {name: Surface(points[name], triangles[name]) for name in points}
+    return Body(vtk_to_numpy(grid.GetPoints().GetData()), cells, sets, surfaces, inner)
+
+
+def write_deformed(
+    path: str | Path, body: Body, displacement: ArrayLike, fields: Mapping[str, ArrayLike] | None = None
+) -> None:
+    """Write the deformed body with its displacement and other fields to a VTU file for ParaView.
+
+    Args:
+        path: file to write, `.vtu`.
+        body: the body at rest.
+        displacement: nodal displacements, (n, 3), metres.
+        fields: further fields by name, one row a node, or one row a cell.
+
+    Raises:
+        FileError: another suffix, or the file could not be written.
+        ValueError: a field with another number of rows.
+    """
+    moved = np.asarray(displacement, dtype=np.float64)
+    if moved.shape != body.points.shape:
+        raise ValueError(f"displacement: expected shape {body.points.shape}, got {moved.shape}.")
+    grid = _grid(body.points + moved, body.cells)
+    _add(grid.GetPointData(), "displacement", moved)
+    for name, field in (fields or {}).items():
+        array = np.asarray(field)
+        if array.ndim not in (1, 2) or len(array) not in (len(body.points), len(body.cells)):
+            raise ValueError(f"fields[{name!r}]: expected a row for each of {len(body.points)} nodes or "
+                             f"{len(body.cells)} cells, got shape {array.shape}.")  # fmt: skip
+        _add(grid.GetPointData() if len(array) == len(body.points) else grid.GetCellData(), name, array)
+    _write(Path(path), grid)
+
+
+def _existing(path: str | Path) -> Path:
+    path = Path(path)
+    if not path.is_file():
+        raise FileError(f"{path}: no such file." if not path.exists() else f"{path}: expected a file, got a folder.")
+    if path.stat().st_size == 0:
+        raise FileError(f"{path}: the file is empty.")
+    return path
+
+
+def _read(path: str | Path) -> _Mesh:
+    path = _existing(path)
+    suffix = path.suffix.lower()
+    if suffix in _VTK:
+        mesh = _from_vtk(path)
+    elif suffix in _MESHIO:
+        mesh = _from_meshio(path)
+    else:
+        known = ", ".join((*_MESHIO, *_VTK))
+        raise FileError(f"{path}: expected a mesh file ({known}), got suffix {suffix!r}.")
+    if len(mesh.points) == 0:
+        raise FileError(f"{path}: the file holds no points; it may be truncated or damaged.")
+    if not np.isfinite(mesh.points).all():
+        raise FileError(f"{path}: expected finite coordinates, got NaN or infinity.")
+    for name, block in mesh.cells.items():
+        if block.min(initial=0) < 0 or block.max(initial=0) >= len(mesh.points):
+            raise FileError(f"{path}: a {name} refers to a point that is not there; the file may be damaged.")
+    return mesh
+
+
+def _from_meshio(path: Path) -> _Mesh:
+    said = io.StringIO()
+    try:
+        # meshio prints its complaints and may end the process on a file that it cannot read.
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mesh = meshio.read(path)
+            points = np.asarray(mesh.points, dtype=np.float64)
+            blocks: dict[str, list[Ints]] = {}
+            for block in mesh.cells:
+                blocks.setdefault(block.type, []).append(np.asarray(block.data, dtype=np.int64))
+    except (Exception, SystemExit) as error:
+        reason = " ".join(f"{said.getvalue()} {error}".split())
+        raise FileError(f"{path}: could not be read as {path.suffix[1:]}; the file may be truncated or damaged "
+                        f"({type(error).__name__}: {reason[:200]}).") from error  # fmt: skip
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise FileError(f"{path}: expected points with three coordinates, got shape {points.shape}.")
+    cells = {name: np.concatenate(parts) for name, parts in blocks.items()}
+    return _Mesh(points, cells)
+
+
+@contextlib.contextmanager
+def _vtk_messages() -> Iterator[vtkStringOutputWindow]:
+    window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
+    loudness = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkOutputWindow.SetInstance(window)
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    try:
+        yield window
+    finally:
+        vtkLogger.SetStderrVerbosity(loudness)
+        vtkOutputWindow.SetInstance(before)
+
+
+def _read_vtk(path: Path) -> Any:
+    reader = _VTK[path.suffix.lower()]()
+    reader.SetFileName(str(path))
+    with _vtk_messages() as window:
+        reader.Update()
+        data = reader.GetOutput()
+        said = " ".join(window.GetOutput().split())
+    if said or data is None or reader.GetErrorCode():
+        raise FileError(f"{path}: could not be read as {path.suffix[1:]}; the file may be truncated or damaged "
+                        f"({said[:200] or 'VTK gave no reason'}).")  # fmt: skip
+    return data
+
+
+def _from_vtk(path: Path) -> _Mesh:
+    data = _read_vtk(path)
+    if data.IsA("vtkPolyData"):
+        return _Mesh(_vtk_points(data), {k: v for k, v in _poly_blocks(data).items() if len(v)})
+    if data.IsA("vtkUnstructuredGrid"):
+        return _Mesh(_vtk_points(data), _grid_blocks(data))
+    raise FileError(f"{path}: expected an unstructured grid or polygons, got {data.GetClassName()}.")
+
+
+def _vtk_points(data: Any) -> Floats:
+    if data.GetNumberOfPoints() == 0:
+        return np.empty((0, 3))
+    return vtk_to_numpy(data.GetPoints().GetData()).astype(np.float64)
+
+
+def _poly_blocks(data: Any) -> dict[str, Ints]:
+    # Any polygon and strip becomes triangles; point numbers stay.
+    triangulate = vtkTriangleFilter()
+    triangulate.PassVertsOff()
+    triangulate.PassLinesOff()
+    triangulate.SetInputData(data)
+    triangulate.Update()
+    polygons = triangulate.GetOutput().GetPolys()
+    if polygons.GetNumberOfCells() == 0:
+        return {}
+    return {"triangle": vtk_to_numpy(polygons.GetConnectivityArray()).astype(np.int64).reshape(-1, 3)}
+
+
+def _grid_blocks(grid: Any) -> dict[str, Ints]:
+    if grid.GetNumberOfCells() == 0:
+        return {}
+    array = grid.GetCells()
+    types = np.array([grid.GetCellType(i) for i in range(grid.GetNumberOfCells())])
+    connectivity = vtk_to_numpy(array.GetConnectivityArray()).astype(np.int64)
+    sizes = np.array([grid.GetCellSize(i) for i in range(len(types))])
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    blocks = {}
+    for kind in np.unique(types):
+        name, corners = _VTK_CORNERS.get(int(kind), (f"VTK type {kind}", 1))
+        blocks[name] = connectivity[starts[types == kind][:, None] + np.arange(corners)]
+    return blocks
+
+
+def _read_table(path: Path) -> Floats:
+    try:
+        if path.suffix.lower() == ".npy":
+            return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+        lines = [line for line in path.read_text().replace(",", " ").replace(";", " ").splitlines() if line.strip()]
+        if lines and not _is_numeric(lines[0]):
+            lines = lines[1:]  # column names, or a comment
+        return np.array([line.split() for line in lines], dtype=np.float64).reshape(len(lines), -1 if lines else 3)
+    except (ValueError, EOFError, OSError, UnicodeDecodeError) as error:
+        raise FileError(f"{path}: expected rows of three numbers; the file may be truncated or damaged "
+                        f"({error}).") from error  # fmt: skip
+
+
+def _is_numeric(line: str) -> bool:
+    try:
+        return len([float(word) for word in line.split()]) > 0
+    except ValueError:
+        return False
+
+
+def _surface(path: Path, mesh: _Mesh, unit: Unit, axes: Axes) -> Surface:
+    triangles = mesh.triangles
+    if len(triangles) == 0:
+        raise FileError(f"{path}: expected a surface of triangles, got {mesh.content}.")
+    points = mesh.points
+    if path.suffix.lower() == ".stl":
+        # An STL repeats every vertex in each of its triangles.
+        points, numbers = np.unique(points, axis=0, return_inverse=True)
+        triangles = numbers.ravel()[triangles]
+    used, numbers = np.unique(triangles, return_inverse=True)
+    points = _in_metres(path, points[used], unit, axes, smallest=_SMALLEST)
+    return Surface(points, numbers.reshape(-1, 3).astype(np.int64))
+
+
+def _volume(path: Path, mesh: _Mesh, unit: Unit, axes: Axes) -> tuple[Floats, Ints]:
+    kinds = [kind for kind in ("tetra", "hexahedron") if kind in mesh.cells]
+    if not kinds:
+        advice = "; a surface must be made solid first (softtwin build does it)" if len(mesh.triangles) else ""
+        raise FileError(f"{path}: expected a volume mesh of tetrahedra or hexahedra, got {mesh.content}{advice}.")
+    if len(kinds) == 2:
+        raise FileError(f"{path}: expected one kind of cells, got {mesh.content}.")
+    points = _in_metres(path, mesh.points, unit, axes, smallest=_SMALLEST)
+    return points, _turned(path, points, mesh.cells[kinds[0]])
+
+
+def _turned(path: Path, points: Floats, cells: Ints) -> Ints:
+    if (corner_jacobians(points, cells) >= 0).any():
+        return cells
+    _log.info("%s: all %d cells were inside out and have been turned", path, len(cells))
+    return cells[:, [0, 2, 1, 3]] if cells.shape[1] == 4 else cells[:, [4, 5, 6, 7, 0, 1, 2, 3]]
+
+
+def _in_metres(path: Path, points: Floats, unit: Unit, axes: Axes, smallest: float) -> Floats:
+    if unit not in _METRES:
+        raise ValueError(f"unit: expected 'm', 'cm' or 'mm', got {unit!r}.")
+    if axes not in ("lps", "ras"):
+        raise ValueError(f"axes: expected 'lps' or 'ras', got {axes!r}.")
+    # Dividing by a whole number rounds once; multiplying by 0.001 would round twice.
+    points = points / round(1 / _METRES[unit])
+    if axes == "ras":
+        points = points * np.array([-1.0, -1.0, 1.0])
+    _warn_size(path, float(np.ptp(points, axis=0).max()), unit, smallest)
+    return points
+
+
+def _warn_size(path: Path, size: float, unit: Unit, smallest: float) -> None:
+    if smallest <= size <= _LARGEST or not np.isfinite(size):
+        return
+    fits = [u for u, m in _METRES.items() if smallest <= size * m / _METRES[unit] <= _LARGEST]
+    flag = f"--unit {fits[-1]}" if fits else "--unit"
+    warnings.warn(
+        f"{path} is {size:.3g} m across when read in {unit}, outside the {_SMALLEST * 1e3:g} mm to {_LARGEST:g} m of "
+        f"an organ; if it is in another unit, say so with {flag}.",
+        UnitWarning,
+        stacklevel=4,
+    )
+
+
+def _grid(points: Floats, cells: Ints) -> vtkUnstructuredGrid:
+    grid, nodes, array = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
+    nodes.SetData(numpy_to_vtk(points, deep=True))
+    offsets = np.arange(0, cells.size + 1, cells.shape[1])
+    array.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(cells.ravel(), deep=True))
+    grid.SetPoints(nodes)
+    grid.SetCells(VTK_TETRA if cells.shape[1] == 4 else VTK_HEXAHEDRON, array)
+    return grid
+
+
+def _add(data: Any, name: str, array: NDArray[Any]) -> None:
+    if array.dtype == bool:
+        array = array.astype(np.uint8)
+    converted = numpy_to_vtk(np.ascontiguousarray(array), deep=True)
+    converted.SetName(quote(name, safe=_PLAIN))  # VTK writes names into XML as they are
+    data.AddArray(converted)
+
+
+def _named(arrays: Mapping[str, Any], prefix: str) -> dict[str, NDArray[Any]]:
+    return {unquote(name[len(prefix) :]): vtk_to_numpy(a) for name, a in arrays.items() if name.startswith(prefix)}
+
+
+def _write(path: Path, grid: vtkUnstructuredGrid) -> None:
+    if path.suffix.lower() != ".vtu":
+        raise FileError(f"{path}: expected the suffix .vtu, got {path.suffix!r}.")
+    partial = path.with_name(f".{path.name}.partial")
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetFileName(str(partial))
+    writer.SetInputData(grid)
+    writer.SetDataModeToAppended()
+    writer.EncodeAppendedDataOff()
+    with _vtk_messages() as window:
+        written = writer.Write()
+        said = " ".join(window.GetOutput().split())
+    if not written or said:
+        partial.unlink(missing_ok=True)
+        raise FileError(f"{path}: could not be written; is the folder there, and is the disk full? ({said[:200]}).")
+    os.replace(partial, path)

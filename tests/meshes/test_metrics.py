@@ -1,0 +1,106 @@
+import numpy as np
+import pytest
+from softtwin.meshes.body import Body
+from softtwin.meshes.metrics import (
+    cell_volumes,
+    dihedral_angles,
+    mesh_quality,
+    net_force_error,
+    nodal_errors,
+    relative_error,
+    scaled_jacobians,
+    target_errors,
+    tetrahedron_quality,
+    thesis_error,
+)
+from softtwin.meshes.shapes import beam
+
+REGULAR = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)[[0, 2, 1, 3]]
+CELL = np.arange(4)[None]
+ROUNDING = 100 * np.finfo(float).eps
+
+
+def test_errors_of_known_distances() -> None:
+    truth = np.zeros((4, 3))
+    found = np.array([[1, 0, 0], [0, 2, 0], [0, 0, 3], [0, 0, 0.0]])
+    errors = nodal_errors(found, truth)
+    assert errors.mean == pytest.approx(1.5) and errors.rms == pytest.approx(np.sqrt(3.5)) and errors.max == 3
+    assert errors.p95 == pytest.approx(np.percentile([1, 2, 3, 0], 95))
+    assert target_errors(found, truth) == errors
+    assert "max 3e+03 mm" in str(errors)
+
+
+def test_relative_and_thesis_errors_of_a_batch() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=(5, 20, 3))
+    found = truth * 1.1
+    assert np.allclose(relative_error(found, truth), 0.1, rtol=ROUNDING * 10)
+    assert np.allclose(thesis_error(found, truth), 0.1 * np.linalg.norm(truth.reshape(5, -1), axis=1) / 20)
+    assert relative_error(found, truth).shape == thesis_error(found, truth).shape == (5,)
+
+
+def test_a_relative_error_without_truth_is_infinite_or_zero() -> None:
+    zero = np.zeros((2, 3))
+    assert relative_error(zero, zero) == 0 and np.isinf(relative_error(zero + 1, zero))
+
+
+def test_the_net_force_alone_counts() -> None:
+    forces = np.array([[1.0, 0, 0], [0, 2, 0], [0, 0, 2]])
+    assert net_force_error(forces, forces.sum(axis=0)).newtons == 0
+    assert net_force_error(forces[::-1], forces).relative == 0
+    error = net_force_error(forces, [1, 2, 1.0])
+    assert error.newtons == pytest.approx(1) and error.relative == pytest.approx(1 / np.sqrt(6))
+    assert np.isinf(net_force_error(forces, np.zeros(3)).relative)
+
+
+def test_arrays_that_do_not_match_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"expected one shape \(..., n, 3\), got \(2, 3\) and \(3, 3\)"):
+        nodal_errors(np.zeros((2, 3)), np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="got NaN or infinity"):
+        relative_error(np.full((2, 3), np.nan), np.zeros((2, 3)))
+    with pytest.raises(ValueError, match=r"expected shapes \(n, 3\)"):
+        net_force_error(np.zeros((2, 2)), np.zeros(3))
+
+
+def test_a_regular_tetrahedron_is_ideal() -> None:
+    assert tetrahedron_quality(REGULAR, CELL) == pytest.approx([1], rel=ROUNDING)
+    assert scaled_jacobians(REGULAR, CELL) == pytest.approx([1], rel=ROUNDING)
+    assert dihedral_angles(REGULAR, CELL) == pytest.approx(np.full((1, 6), np.degrees(np.arccos(1 / 3))), rel=ROUNDING)
+    assert cell_volumes(REGULAR, CELL) == pytest.approx([8 / 3], rel=ROUNDING)
+
+
+def test_quality_does_not_change_with_size_or_place() -> None:
+    points = np.random.default_rng(4).normal(size=(4, 3))
+    moved = 1e-3 * points + [1, 2, 3]
+    # Differences of numbers near 3 that are 1e-3 apart keep 1e-3 / 3 of the precision.
+    tolerance = 1e5 * np.finfo(float).eps
+    assert tetrahedron_quality(moved, CELL) == pytest.approx(tetrahedron_quality(points, CELL), rel=tolerance)
+    assert dihedral_angles(moved, CELL) == pytest.approx(dihedral_angles(points, CELL), rel=tolerance)
+
+
+def test_a_flat_tetrahedron_has_no_quality_and_an_inverted_one_a_negative() -> None:
+    flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.0]])
+    assert tetrahedron_quality(flat, CELL) == 0 and scaled_jacobians(flat, CELL) == 0
+    assert tetrahedron_quality(REGULAR, CELL[:, [1, 0, 2, 3]]) == pytest.approx([-1], rel=ROUNDING)
+
+
+def test_the_volumes_of_skewed_cells_fill_the_body(skewed: Body) -> None:
+    assert cell_volumes(skewed.points, skewed.cells).sum() == pytest.approx(0.4 * 0.1 * 0.2, rel=ROUNDING)
+    assert cell_volumes(skewed.points, skewed.cells).std() > 1e-6
+
+
+def test_the_report_on_a_beam_of_cubes() -> None:
+    quality = mesh_quality(beam((4, 2, 2), (0.4, 0.2, 0.2)))
+    assert (quality.nodes, quality.cells, quality.kind) == (45, 16, "hexahedra")
+    assert quality.volume == pytest.approx(0.016) and quality.volume_ratio == pytest.approx(1)
+    assert quality.min_scaled_jacobian == pytest.approx(1) and np.isnan(quality.min_radius_ratio)
+    assert quality.min_dihedral == pytest.approx(90) and quality.max_dihedral == pytest.approx(90)
+    assert quality.min_edge == pytest.approx(0.1) and quality.max_edge == pytest.approx(0.1)
+    assert "hexahedra                    16" in str(quality) and "16 litres" in str(quality)
+
+
+def test_the_report_on_the_liver_phantom(liver: Body) -> None:
+    quality = mesh_quality(liver)
+    assert quality.volume == pytest.approx(liver.volume, rel=len(liver.cells) * np.finfo(float).eps)
+    assert 0 < quality.min_radius_ratio < 1 and 0 < quality.min_dihedral < 70.6 < quality.max_dihedral < 180
+    assert quality.min_edge < quality.mean_edge < quality.max_edge < 0.05
