@@ -56,9 +56,9 @@ def forward_model(name: str, folder: Path, body: Body, config: Config) -> Iterat
         config: its configuration; gives the reference its material.
     """
     if name == "surrogate":
-        from softtwin.surrogate.predictor import Surrogate  # torch is needed here alone
+        from softtwin.surrogate.predictor import load  # torch is needed here alone
 
-        yield Surrogate.load(folder, body)
+        yield load(folder, body)
         return
     from softtwin.reference.adjoint import ReferenceModel  # FEniCSx is needed here alone
     from softtwin.reference.equilibrium import NewtonOptions, Problem

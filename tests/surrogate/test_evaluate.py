@@ -1,0 +1,79 @@
+"""Held-out errors: what is printed is what is defined."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from softtwin.meshes.shapes import beam
+from softtwin.reference.dataset import DataSet
+from softtwin.surrogate.evaluate import DEFINITIONS, cosine, evaluate, registration_cosines, spread, table
+from softtwin.surrogate.predictor import Surrogate
+
+
+def _predictions(surrogate: Surrogate, data: DataSet) -> np.ndarray:
+    forces = np.zeros((len(data.samples("test")), *data.body.points.shape))
+    forces[:, data.response.loaded] = data.samples("test").forces
+    return np.stack([surrogate.solve(load) for load in forces])
+
+
+def test_errors_follow_their_definitions(surrogate: Surrogate, data: DataSet) -> None:
+    error = _predictions(surrogate, data) - data.samples("test").displacements
+    truth = data.samples("test").displacements
+    found = evaluate(surrogate, data)
+    distances = np.sqrt((error**2).sum(axis=2))
+    assert found.nodal_error.mean == pytest.approx(distances.mean())
+    assert found.largest_error.mean == pytest.approx(distances.max(axis=1).mean())
+    norms = np.sqrt((error**2).sum(axis=(1, 2)))
+    assert found.thesis_error.mean == pytest.approx(norms.mean() / 45)
+    relative = norms / np.sqrt((truth**2).sum(axis=(1, 2)))
+    assert found.relative_error.median == pytest.approx(np.median(relative))
+    assert found.displacement_norm.max == pytest.approx(np.sqrt((truth**2).sum(axis=(1, 2))).max())
+
+
+def test_gradients_of_the_reduced_network_point_where_the_truth_does(
+    reduced: Surrogate, data: DataSet, closed_form: object
+) -> None:
+    assert evaluate(reduced, data).gradient_cosine.median > 0.99
+    samples = data.samples("test")
+    loads = {u.tobytes(): f for u, f in zip(samples.displacements, samples.forces, strict=True)}
+
+    def adjoint(displacement: np.ndarray, cotangent: np.ndarray) -> np.ndarray:
+        load = np.zeros_like(cotangent)
+        load[data.response.loaded] = loads[displacement.tobytes()]
+        return closed_form.adjoint(load, cotangent)  # type: ignore[attr-defined]
+
+    cosines = registration_cosines(reduced, data, samples, adjoint)
+    assert len(cosines) == len(samples)
+    assert np.median(cosines) > 0.99
+
+
+def test_rejected_draws_are_counted_and_left_out(reduced: Surrogate, data: DataSet) -> None:
+    found = evaluate(reduced, data)
+    assert found.rejected == {"unstable equilibrium": 3}  # draws 84, 89 and 94 of 80..95
+    assert found.samples == 13
+    assert evaluate(reduced, data, limit=5).rejected == {"unstable equilibrium": 1}
+
+
+def test_the_table_prints_every_definition(surrogate: Surrogate, data: DataSet) -> None:
+    text = table({"this one": evaluate(surrogate, data)})
+    for _, symbol, definition, _ in DEFINITIONS:
+        assert f"{symbol}: {definition}" in text
+    assert "13 accepted test samples averaged, 3 draws rejected (3 unstable equilibrium)" in text
+
+
+def test_spread_of_known_values() -> None:
+    found = spread(np.arange(101.0))
+    assert (found.mean, found.median, found.p5, found.p95, found.max) == (50.0, 50.0, 5.0, 95.0, 100.0)
+
+
+def test_cosine_of_known_angles() -> None:
+    x, y = np.array([[1.0, 0.0]]), np.array([[1.0, 1.0]])
+    assert cosine(x, y) == pytest.approx(np.sqrt(0.5))
+    assert cosine(x, -3.0 * x) == -1.0
+    assert cosine(x, 0.0 * x) == 0.0
+
+
+def test_a_surrogate_of_another_body_is_refused(reduced: Surrogate, data: DataSet) -> None:
+    other = Surrogate(beam((4, 2, 2), (0.4, 0.2, 0.3)), reduced.frame, reduced.core, reduced.card)
+    with pytest.raises(ValueError, match="another body"):
+        evaluate(other, data)

@@ -1,0 +1,203 @@
+"""The surrogate as a forward model: derivatives, the restricted fast path, saving and loading."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from softtwin.meshes.body import Body
+from softtwin.meshes.shapes import beam
+from softtwin.reference.dataset import DataSet
+from softtwin.surrogate.predictor import CARD, WEIGHTS, Surrogate, TwinError, load, save
+
+STEPS = 0.5 ** np.arange(3, 8)
+
+
+def _direction(surrogate: Surrogate, seed: int, scale: float) -> np.ndarray:
+    direction = np.zeros_like(surrogate.body.points)
+    loaded = surrogate.frame.loaded
+    direction[loaded] = scale * np.random.default_rng(seed).standard_normal((len(loaded), 3))
+    return direction
+
+
+def _rates(remainders: list[float]) -> np.ndarray:
+    assert min(remainders) > 0.0
+    return np.log2(np.array(remainders[:-1]) / np.array(remainders[1:]))
+
+
+def test_sensitivity_is_the_derivative(reduced: Surrogate, forces: np.ndarray) -> None:
+    direction = _direction(reduced, 0, np.abs(forces).max())
+    start = reduced.solve(forces)
+    slope = reduced.sensitivity(direction.reshape(-1, 1)).reshape(-1, 3)
+    remainders = [np.linalg.norm(reduced.solve(forces + h * direction) - start - h * slope) for h in STEPS]
+    assert _rates(remainders)[-1] == pytest.approx(2.0, abs=0.1)
+
+
+def test_pullback_is_the_gradient(reduced: Surrogate, forces: np.ndarray) -> None:
+    """Of the squared misfit, whose gradient with respect to the displacement is the displacement."""
+    direction = _direction(reduced, 1, np.abs(forces).max())
+    start = reduced.solve(forces)
+    slope = float(np.vdot(reduced.pullback(start), direction))
+    value = 0.5 * float(np.vdot(start, start))
+    moved = [reduced.solve(forces + h * direction) for h in STEPS]
+    remainders = [abs(0.5 * float(np.vdot(u, u)) - value - h * slope) for h, u in zip(STEPS, moved, strict=True)]
+    assert _rates(remainders)[-1] == pytest.approx(2.0, abs=0.1)
+
+
+def test_perceptron_is_linear_between_its_kinks(perceptron: Surrogate, forces: np.ndarray) -> None:
+    direction = _direction(perceptron, 2, 1e-7 * np.abs(forces).max())
+    start = perceptron.solve(forces)
+    slope = perceptron.sensitivity(direction.reshape(-1, 1)).reshape(-1, 3)
+    change = perceptron.solve(forces + direction) - start
+    # what cancels in the difference: round-off of values seven decades above it
+    assert np.linalg.norm(change - slope) < 1e-6 * np.linalg.norm(change)
+
+
+def test_pullback_and_sensitivity_are_adjoint(surrogate: Surrogate, forces: np.ndarray) -> None:
+    surrogate.solve(forces)
+    columns = np.stack([_direction(surrogate, seed, 1.0).ravel() for seed in range(3)], axis=1)
+    cotangent = np.random.default_rng(9).standard_normal(surrogate.body.points.shape)
+    forward = cotangent.ravel() @ surrogate.sensitivity(columns)
+    backward = surrogate.pullback(cotangent).ravel() @ columns
+    assert np.abs(forward).min() > 0.0
+    assert np.abs(forward - backward).max() < 1e-11 * np.abs(forward).max()
+
+
+def test_many_columns_at_once_equal_few(surrogate: Surrogate, forces: np.ndarray) -> None:
+    """More columns than the network has coordinates take another way."""
+    surrogate.solve(forces)
+    columns = np.stack([_direction(surrogate, seed, 1.0).ravel() for seed in range(200)], axis=1)
+    together = surrogate.sensitivity(columns)
+    apart = np.concatenate([surrogate.sensitivity(columns[:, i : i + 1]) for i in range(200)], axis=1)
+    assert np.abs(together - apart).max() < 1e-11 * np.abs(apart).max()
+
+
+def test_derivatives_are_those_of_the_last_state(reduced: Surrogate, forces: np.ndarray) -> None:
+    reduced.solve(forces)
+    loaded = reduced.pullback(forces)
+    reduced.reset()
+    assert np.abs(reduced.pullback(forces) - loaded).max() > 1e-3 * np.abs(loaded).max()
+
+
+def test_restricted_agrees_with_the_whole(surrogate: Surrogate, forces: np.ndarray) -> None:
+    basis = np.stack([_direction(surrogate, seed, np.abs(forces).max()).ravel() for seed in range(4)], axis=1)
+    rows = np.array([40, 3, 17])
+    c = np.array([0.3, -0.2, 0.5, 0.1])
+    restricted = surrogate.restricted(rows, basis)
+    whole = surrogate.solve((basis @ c).reshape(-1, 3))
+    jacobian = surrogate.sensitivity(basis).reshape(-1, 3, 4)[rows].reshape(-1, 4)
+    tolerance = 1e-11 * np.abs(whole).max()
+    assert np.abs(restricted.solve_coefficients(c) - whole[rows]).max() < tolerance
+    assert np.abs(restricted.full(c) - whole).max() < tolerance
+    assert np.abs(restricted.jacobian(c) - jacobian).max() < 1e-11 * np.abs(jacobian).max()
+    cotangent = np.random.default_rng(3).standard_normal((3, 3))
+    gradient = restricted.gradient(c, cotangent)
+    assert np.abs(gradient - cotangent.ravel() @ jacobian).max() < 1e-11 * np.abs(gradient).max()
+
+
+def test_forces_where_none_were_trained_are_refused_by_name(surrogate: Surrogate) -> None:
+    inside = int(np.setdiff1d(surrogate.body.free, surrogate.frame.loaded)[0])
+    bad = np.zeros_like(surrogate.body.points)
+    bad[inside, 1] = 1e-9
+    with pytest.raises(ValueError, match=rf"1 other nodes, first \[{inside}\]"):
+        surrogate.solve(bad)
+    with pytest.raises(ValueError, match=rf"columns.*first \[{inside}\]"):
+        surrogate.sensitivity(bad.reshape(-1, 1))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_forces_that_are_not_finite_are_refused(surrogate: Surrogate, value: float) -> None:
+    with pytest.raises(ValueError, match="forces: expected finite numbers"):
+        surrogate.solve(np.full_like(surrogate.body.points, value))
+
+
+def test_wrong_shapes_are_refused(surrogate: Surrogate) -> None:
+    count = surrogate.body.points.size
+    with pytest.raises(ValueError, match=r"forces: expected shape \(45, 3\), got \(3,\)"):
+        surrogate.solve(np.zeros(3))
+    with pytest.raises(ValueError, match=rf"columns: expected shape \({count}, k\)"):
+        surrogate.sensitivity(np.zeros((4, 2)))
+    with pytest.raises(ValueError, match="rows: expected 0..44, got 0..45"):
+        surrogate.restricted([0, 45], np.zeros((count, 2)))
+    with pytest.raises(ValueError, match=r"coefficients: expected shape \(2,\), got \(3,\)"):
+        surrogate.restricted([0], np.zeros((count, 2))).solve_coefficients(np.zeros(3))
+
+
+# ------------------------------------------------------------------ on disk
+
+
+def test_a_loaded_surrogate_is_the_saved_one_bit_by_bit(
+    surrogate: Surrogate, forces: np.ndarray, tmp_path: Path
+) -> None:
+    save(surrogate, tmp_path / "twin")
+    again = load(tmp_path / "twin", surrogate.body)
+    assert np.array_equal(again.solve(forces), surrogate.solve(forces))
+    assert np.array_equal(again.pullback(forces), surrogate.pullback(forces))
+    assert again.card["architecture"] == surrogate.card["architecture"]
+    assert {path.name for path in (tmp_path / "twin").iterdir()} == {WEIGHTS, CARD}
+
+
+def test_the_card_says_what_it_was_trained_on(reduced: Surrogate, data: DataSet, tmp_path: Path) -> None:
+    save(reduced.with_card(held_out={"relative": 0.01}), tmp_path)
+    card = json.loads((tmp_path / CARD).read_text())
+    assert card["samples"] == {
+        "train": len(data.samples("train")),
+        "validation": len(data.samples("validation")),
+        "rejected": {"unstable equilibrium": 64 // 5},
+    }
+    assert card["data"]["versions"] == {"closed form": "1"}
+    assert card["plan"]["seed"] == 0
+    assert card["body"] == data.body.fingerprint
+    assert card["held_out"] == {"relative": 0.01}
+    assert "not a medical device" in card["notice"]
+    peaks = np.linalg.norm(data.samples("train").displacements, axis=2)
+    assert card["domain"]["largest_displacement_m"] == peaks.max()
+
+
+def test_an_empty_folder_is_no_twin(small_beam: Body, tmp_path: Path) -> None:
+    with pytest.raises(TwinError, match=r"expected a twin with surrogate\.json"):
+        load(tmp_path, small_beam)
+
+
+def test_a_twin_of_another_body_is_refused(reduced: Surrogate, tmp_path: Path) -> None:
+    save(reduced, tmp_path)
+    with pytest.raises(TwinError, match="belongs to another body"):
+        load(tmp_path, beam((4, 2, 2), (0.4, 0.2, 0.21)))
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "delete"])
+def test_damaged_weights_are_refused(reduced: Surrogate, tmp_path: Path, damage: str) -> None:
+    save(reduced, tmp_path)
+    path = tmp_path / WEIGHTS
+    content = bytearray(path.read_bytes())
+    if damage == "cut":
+        path.write_bytes(content[: len(content) // 2])
+    elif damage == "flip":
+        content[-1] ^= 1
+        path.write_bytes(content)
+    else:
+        path.unlink()
+    expected = "cannot be read" if damage == "delete" else "truncated or changed"
+    with pytest.raises(TwinError, match=expected):
+        load(tmp_path, reduced.body)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda text: text[: len(text) // 2], "truncated"),
+        (lambda text: text.replace('"format": 1', '"format": 99'), "card of format 1"),
+        (lambda text: text.replace('"weights"', '"heights"'), "lacks"),
+        (lambda text: text.replace('"architecture": "reduced"', '"architecture": "oracle"', 1), "known architecture"),
+    ],
+)
+def test_damaged_cards_are_refused(reduced: Surrogate, tmp_path: Path, edit: object, message: str) -> None:
+    save(reduced, tmp_path)
+    text = (tmp_path / CARD).read_text()
+    changed = edit(text)  # type: ignore[operator]
+    assert changed != text
+    (tmp_path / CARD).write_text(changed)
+    with pytest.raises(TwinError, match=message):
+        load(tmp_path, reduced.body)
