@@ -252,6 +252,7 @@ def generate_stage(space: Workspace, redo: tuple[int, ...] = ()) -> DataSet | No
         loads=load_plan(space.config),
         samples={"train": samples.train, "validation": samples.validation, "test": samples.test},
         block=samples.block,
+        path=samples.path,
         seed=samples.seed,
     )
     if MPI.COMM_WORLD.rank == 0:

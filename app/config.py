@@ -63,6 +63,7 @@ class SamplesSection(_Section):
     validation: Count = Field(64, description="draws to choose the best weights with")
     test: Count = Field(128, description="draws held out, never seen in training")
     block: Count = Field(8, description="draws in one block of work")
+    path: Count = Field(1, description="draws that share a load at growing sizes, each solved from the one before; divides block")
     seed: int = Field(0, ge=0, description="seed of everything random")
     ranks: int = Field(0, ge=0, description="MPI ranks that build and quickstart start; 0: one a core")
 

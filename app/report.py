@@ -1,0 +1,746 @@
+"""The report: one HTML file with pictures and figures of whatever a twin's stages have made so far."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import platform
+import re
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path, PurePath
+from typing import Any
+
+import jinja2
+import matplotlib
+import numpy as np
+import pyvista
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+from vtkmodules.vtkCommonCore import vtkLogger
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.embedding import Embedding, carried
+from softtwin.meshes.files import read_body
+from softtwin.meshes.metrics import mesh_quality, nodal_errors
+from softtwin.reference.dataset import SPLITS, DataSet
+from softtwin.registration.objective import CloudObjective
+
+from .build import Workspace, target_points
+from .config import Config, to_toml
+from .register import NOTICE
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Section = dict[str, Any]
+
+ORGAN, OBSERVED, FIXED, CLOUD, TRUTH, FOUND = "#c4604a", "#1c6fd1", "#d9480f", "#1c6fd1", "#2f9e44", "#f08c00"
+_VESSELS = ("#3b5bdb", "#9c36b5", "#0c8599", "#5c940d")
+_TUMOUR = re.compile("tumou?r|lesion|metasta", re.IGNORECASE)
+_DISPLACEMENT, _ERROR = "viridis", "YlOrRd"
+_MODES = 6
+_MODE_SIZE = 0.12  # largest displacement of a mode in its picture, relative to the body
+_SUPERSAMPLING = 2  # VTK counts points and lines in the pixels before they are averaged
+_MOST_DRAWS = 1024  # of each split that the histograms look at
+_READ_ERRORS = (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile)
+# In a process of its own: where VTK can draw nowhere, it ends the process that asks it to.
+_PROBE = """
+import pyvista
+plotter = pyvista.Plotter(off_screen=True, window_size=(16, 16))
+plotter.add_mesh(pyvista.Sphere())
+assert plotter.screenshot(return_img=True).min() < 255
+"""
+_PROBE_TIMEOUT_S = 60
+
+
+class _Missing(Exception):  # noqa: N818 - not an error: a section whose stage has not run
+    """An input that is not there yet, and the command that makes it."""
+
+
+def report_stage(space: Workspace) -> Path:
+    """Write report.html into the workspace's folder: one file that needs nothing else, in light, dark and print.
+
+    A section whose input is not there yet, or cannot be read, says so and names the command that makes it.
+
+    Args:
+        space: the workspace.
+
+    Returns:
+        The file written.
+    """
+    space.folder.mkdir(parents=True, exist_ok=True)
+    pyvista.OFF_SCREEN = True
+    studio = Studio(rendering_problem())
+    sections = {name: _guarded(make, space, studio) for name, make in _SECTIONS.items()}
+    path = space.folder / "report.html"
+    path.write_text(_fill_template(space, studio, sections), encoding="utf-8")
+    return path
+
+
+def _guarded(make: Callable[[Workspace, Studio], Section], space: Workspace, studio: Studio) -> Section:
+    try:
+        return make(space, studio)
+    except _Missing as missing:
+        return {"missing": str(missing)}
+    except _READ_ERRORS as error:
+        return {"missing": without_paths(str(error), space)}
+
+
+def _fill_template(space: Workspace, studio: Studio, sections: Mapping[str, Section]) -> str:
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters.update(figure=figure, mm=lambda metres: figure(1e3 * metres), vector=_vector)
+    environment.globals.update(gradient=_gradient, norm=np.linalg.norm)
+    environment.globals.update(displacement_colours=_DISPLACEMENT, error_colours=_ERROR)
+    template = environment.from_string(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
+    return template.render(
+        title=PurePath(space.config.body.source).stem or "organ", notice=NOTICE, rendering=studio.problem, **sections
+    )
+
+
+def without_paths(text: str, space: Workspace) -> str:
+    """The text with every absolute path cut down to its last name: a report may be passed on."""
+    for folder in (space.folder, space.root):
+        text = text.replace(f"{folder.resolve()}/", "").replace(f"{folder.absolute()}/", "")
+    return re.sub(r"(?<![\w./:])/(?:[^\s/\"'<>]+/)+", "", text)
+
+
+def figure(value: float) -> str:
+    """A number with three significant digits, without an exponent where it is readable without."""
+    if value == 0.0 or 1e-3 <= abs(value) < 1e3:
+        return f"{value:.3g}"
+    return f"{value:,.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.2e}"
+
+
+def _vector(values: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{value:+.3f}" for value in values) + ")"
+
+
+def _gradient(colours: str) -> str:
+    stops = matplotlib.colormaps[colours](np.linspace(0.0, 1.0, 9))
+    return f"linear-gradient(to right, {', '.join(matplotlib.colors.to_hex(stop) for stop in stops)})"
+
+
+# ------------------------------------------------------------------ pictures
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG inside the HTML.
+
+    Args:
+        address: data address of the picture, empty where nothing could be drawn.
+        words: what is to be seen, for those who do not see it.
+        dark: the same for a dark page, empty where one does for both.
+        bar: length of the scale bar, metres; 0 for none.
+        bar_share: its share of the picture's width.
+    """
+
+    address: str
+    words: str
+    dark: str = ""
+    bar: float = 0.0
+    bar_share: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """One thing in a picture.
+
+    Args:
+        points: positions, (n, 3), metres.
+        triangles: node numbers, (t, 3); none: the points themselves are drawn as balls.
+        colour: of the whole.
+        opacity: 0 to 1.
+        values: a figure a node, (n,), shown in colours from 0 to `limit` instead of the one colour.
+        limit: value at the end of the colours.
+        colours: name of the colour map.
+        style: `surface`, `wireframe` or `outline` (what stands against the background).
+        ball: diameter of balls relative to the picture's width.
+    """
+
+    points: Floats
+    triangles: Ints | None = None
+    colour: str = ORGAN
+    opacity: float = 1.0
+    values: Floats | None = None
+    limit: float = 1.0
+    colours: str = _DISPLACEMENT
+    style: str = "surface"
+    ball: float = 0.008
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera without perspective, so that lengths can be compared.
+
+    Args:
+        towards: unit vector from what is seen to the camera, (3,).
+        right: unit vector to the right in the picture, (3,).
+        up: unit vector upwards in the picture, (3,).
+        centre: what stands in the middle, (3,), metres.
+        half: half of width and height, (2,), metres.
+    """
+
+    towards: Floats
+    right: Floats
+    up: Floats
+    centre: Floats
+    half: tuple[float, float]
+
+
+def view_of(towards: Floats, points: Iterable[Floats], margin: float = 1.06) -> View:
+    """The view from a direction that just holds all points.
+
+    Args:
+        towards: direction to the camera, (3,), any length.
+        points: arrays (n, 3), metres.
+        margin: how much larger than needed.
+    """
+    towards = towards / np.linalg.norm(towards)
+    vertical = np.array([0.0, 0.0, 1.0]) if abs(towards[2]) < 0.95 else np.array([0.0, 1.0, 0.0])
+    right = np.cross(vertical, towards)
+    right /= np.linalg.norm(right)
+    up = np.cross(towards, right)
+    seen = np.concatenate(list(points)) @ np.column_stack([right, up, towards])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    centre = np.column_stack([right, up, towards]) @ (0.5 * (low + high))
+    width, height = (margin * max(x, 0.2 * float((high - low)[:2].max())) / 2 for x in (high - low)[:2].tolist())
+    return View(towards, right, up, centre, (width, height))
+
+
+def camera_side(body: Body) -> Floats:
+    """Direction from the body to a camera that sees its observed side, or its broadest side, a little from above."""
+    triangles = body.surfaces.get("observed", body.boundary)
+    a, b, c = (body.points[triangles[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    forward = normals.sum(axis=0)
+    if np.linalg.norm(forward) < 0.2 * np.linalg.norm(normals, axis=1).sum():
+        _, _, axes = np.linalg.svd(body.points - body.points.mean(axis=0), full_matrices=False)
+        away = body.points.mean(axis=0) - body.points[body.fixed].mean(axis=0)
+        forward = axes[2] * (1.0 if axes[2] @ away >= 0 else -1.0)
+    forward = forward / np.linalg.norm(forward)
+    return forward + np.array([0.0, 0.0, 0.3]) + 0.3 * np.cross(forward, [0.0, 0.0, 1.0])
+
+
+def rendering_problem() -> str:
+    """Why pictures cannot be drawn on this machine, empty if they can."""
+    try:
+        told = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return f"VTK did not draw within {_PROBE_TIMEOUT_S} s"
+    return "" if told.returncode == 0 else "VTK found no way to draw off screen (apt-get install libegl1 libgl1)"
+
+
+@dataclass(frozen=True)
+class Studio:
+    """Draws pictures, or says why it cannot.
+
+    Args:
+        problem: why nothing can be drawn, empty if all is well.
+    """
+
+    problem: str
+
+    def picture(self, view: View, layers: Iterable[Layer], words: str, width: int = 760) -> Picture:
+        """Layers seen from a view, on a transparent ground.
+
+        Args:
+            view: the camera.
+            layers: what is seen.
+            words: says what is seen.
+            width: pixels.
+        """
+        bar = _round_length(0.5 * view.half[0])
+        address = "" if self.problem else _png(_render(view, layers, width))
+        return Picture(address, words, bar=bar, bar_share=0.5 * bar / view.half[0])
+
+
+def _render(view: View, layers: Iterable[Layer], width: int) -> NDArray[np.uint8]:
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # it warns of each screen that is not there
+    height = round(width * view.half[1] / view.half[0])
+    plotter: Any = pyvista.Plotter(off_screen=True, window_size=[width, height], lighting="none")
+    plotter.add_light(pyvista.Light(light_type="headlight"))
+    for layer in layers:
+        _add(plotter, layer, width)
+    camera = plotter.camera
+    camera.focal_point, camera.up = view.centre, view.up
+    camera.position = view.centre + 20 * max(view.half) * view.towards
+    camera.parallel_projection, camera.parallel_scale = True, view.half[1]
+    plotter.renderer.ResetCameraClippingRange()
+    plotter.enable_depth_peeling(6)
+    plotter.enable_anti_aliasing("ssaa")
+    image = plotter.screenshot(return_img=True, transparent_background=True)
+    plotter.close()
+    return np.asarray(image)
+
+
+def _add(plotter: Any, layer: Layer, width: int) -> None:
+    if layer.triangles is None:
+        size = _SUPERSAMPLING * layer.ball * width
+        plotter.add_points(layer.points, color=layer.colour, render_points_as_spheres=True, point_size=size)
+        return
+    used, local = np.unique(layer.triangles, return_inverse=True)
+    faces = np.column_stack([np.full(len(layer.triangles), 3), local.reshape(-1, 3)])
+    mesh = pyvista.PolyData(layer.points[used], faces.ravel())
+    if layer.style == "outline":
+        plotter.add_silhouette(mesh, color=layer.colour, line_width=_SUPERSAMPLING * width / 200)
+        return
+    look: dict[str, Any] = {"color": layer.colour}
+    if layer.values is not None:
+        mesh.point_data["values"] = layer.values[used]
+        limits = (0.0, max(layer.limit, 1e-12))  # VTK wants an interval
+        look = {"scalars": "values", "cmap": layer.colours, "clim": limits, "show_scalar_bar": False}
+    if layer.style == "surface":
+        look |= {"smooth_shading": True, "split_sharp_edges": True, "feature_angle": 50.0}
+    look |= {"ambient": 0.4, "diffuse": 0.6, "line_width": _SUPERSAMPLING * width / 900}
+    plotter.add_mesh(mesh, opacity=layer.opacity, style=layer.style, **look)
+
+
+def _png(image: NDArray[np.uint8]) -> str:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG", compress_level=6)
+    return _address(buffer)
+
+
+def _address(buffer: io.BytesIO) -> str:
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def _round_length(length: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not longer."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length * 1.0001))
+
+
+_CHART_STYLE = {"axes.spines.top": False, "axes.spines.right": False, "font.size": 10.0, "axes.facecolor": "none"}
+
+
+def chart(draw: Callable[[Figure], None], words: str, size: tuple[float, float] = (10.0, 3.1)) -> Picture:
+    """A chart for light and for dark pages.
+
+    Args:
+        draw: fills a figure.
+        words: says what is seen.
+        size: width and height, inches.
+    """
+    addresses = []
+    for ink in ("#30363d", "#c9d1d9"):
+        inked = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
+        style: Any = {**dict.fromkeys(inked, ink), **_CHART_STYLE}
+        with matplotlib.rc_context(style):
+            sheet = Figure(figsize=size, layout="constrained", facecolor="none")
+            draw(sheet)
+            buffer = io.BytesIO()
+            sheet.savefig(buffer, format="png", dpi=104)
+        addresses.append(_address(buffer))
+    return Picture(addresses[0], words, dark=addresses[1])
+
+
+# ------------------------------------------------------------------ the organ
+
+
+def inner_colours(names: Iterable[str]) -> dict[str, str]:
+    """A colour for each inner surface: tumours stand out."""
+    names = list(names)
+    vessels = [name for name in names if not _TUMOUR.search(name)]
+    return {name: _VESSELS[vessels.index(name) % len(_VESSELS)] if name in vessels else FOUND for name in names}
+
+
+def _body(space: Workspace) -> Body:
+    if not space.body.exists():
+        raise _Missing("There is no body yet: softtwin mesh organ.toml makes it.")
+    return read_body(space.body)
+
+
+def organ_section(space: Workspace, studio: Studio) -> Section:
+    """The body from both sides, its counts and the quality of its mesh."""
+    body = _body(space)
+    colours = inner_colours(body.inner)
+    observed = [(OBSERVED, "observed side (mesh lines)")] if "observed" in body.surfaces else []
+    inner = [(colours[name], name) for name in body.inner]
+    front = camera_side(body)
+    sides = {
+        "from the camera's side": front,
+        "from behind": -front + np.array([0.0, 0.0, 0.6]),
+        "from above": 0.3 * front + np.array([0.0, 0.0, 1.0]),
+    }
+    pictures = [
+        studio.picture(view_of(towards, [body.points]), organ_layers(body), words, 760)
+        for words, towards in sides.items()
+    ]
+    return {
+        "pictures": pictures,
+        "legend": [(ORGAN, "surface"), *observed, (FIXED, f"{len(body.fixed)} fixed nodes"), *inner],
+        "quality": mesh_quality(body),
+        "fixed": len(body.fixed),
+        "extent": np.ptp(body.points, axis=0).tolist(),
+        "zones": {name: len(nodes) for name, nodes in body.node_sets.items() if name != "fixed"},
+        "inner": {name: (len(surface.points), abs(surface.volume)) for name, surface in body.inner.items()},
+    }
+
+
+def organ_layers(body: Body) -> list[Layer]:
+    """The translucent surface, the mesh of the observed side, the inner surfaces and the fixed nodes."""
+    colours = inner_colours(body.inner)
+    layers = [Layer(body.points, body.boundary, ORGAN, 0.4)]
+    if "observed" in body.surfaces:
+        layers.append(Layer(body.points, body.surfaces["observed"], OBSERVED, 0.35, style="wireframe"))
+    layers += [Layer(surface.points, surface.triangles, colours[name]) for name, surface in body.inner.items()]
+    return [*layers, Layer(body.points[body.fixed], colour=FIXED, ball=0.011)]
+
+
+# ------------------------------------------------------------------ modes and data
+
+
+def _data(space: Workspace) -> DataSet:
+    if not (space.data / "zarr.json").exists():
+        raise _Missing("There is no data set yet: softtwin generate organ.toml makes it.")
+    return DataSet(space.data)
+
+
+def modes_section(space: Workspace, studio: Studio) -> Section:
+    """The softest eigenmodes, coloured by their displacement."""
+    data = _data(space)
+    body, shapes = data.body, data.shapes[:_MODES]
+    size = _MODE_SIZE * body.size
+    moved = [body.points + size * shape / np.linalg.norm(shape, axis=1).max() for shape in shapes]
+    view = view_of(camera_side(body), [body.points, *moved])
+    pictures = []
+    for i, points in enumerate(moved):
+        layers = [
+            Layer(points, body.boundary, values=np.linalg.norm(points - body.points, axis=1), limit=size),
+            Layer(body.points, body.boundary, "#8a929c", style="outline"),
+        ]
+        words = f"mode {i + 1}: {figure(float(data.eigenvalues[i]))} N/m"
+        pictures.append(studio.picture(view, layers, words, 480))
+    return {"pictures": pictures, "count": len(data.shapes), "size": size}
+
+
+def data_section(space: Workspace, studio: Studio) -> Section:
+    """Accepted and rejected draws, how far they move, what they cost."""
+    data = _data(space)
+    missing = data.missing_blocks()
+    if missing:
+        raise _Missing(
+            f"{data.block_count - len(missing)} of {data.block_count} blocks are finished: "
+            "softtwin generate organ.toml goes on."
+        )
+    rejected = data.rejected().reasons
+    peaks: dict[str, Floats] = {split: _peaks(data.samples(split, _MOST_DRAWS).displacements) for split in SPLITS}
+    iterations: dict[str, Ints] = {split: _iterations(data, split) for split in SPLITS}
+    drawn = dict(data.header["samples"])
+    return {
+        "drawn": drawn,
+        "accepted": sum(drawn.values()) - len(rejected),
+        "rejected": {reason: rejected.count(reason) for reason in sorted(set(rejected))},
+        "chart": chart(lambda sheet: _draw_data(sheet, peaks, iterations), "histograms of displacement and iterations"),
+        "looked_at": sum(map(len, peaks.values())),
+        "loaded": len(data.response.loaded),
+        "versions": data.header.get("versions", {}),
+    }
+
+
+def _peaks(displacements: Floats) -> Floats:
+    return np.linalg.norm(displacements, axis=2).max(axis=1)
+
+
+def _iterations(data: DataSet, split: Any) -> Ints:
+    figures = data.figures(split)
+    return figures["iterations"][figures["reason"] == 0][:_MOST_DRAWS]
+
+
+_SPLIT_COLOURS = ("#4c78a8", "#72b7b2", "#f2a65a")
+
+
+def _draw_data(sheet: Figure, peaks: Mapping[str, Floats], iterations: Mapping[str, Ints]) -> None:
+    left, right = sheet.subplots(1, 2)
+    left.hist([1e3 * peaks[split] for split in peaks], bins=24, stacked=True, color=_SPLIT_COLOURS, label=list(peaks))
+    left.set(xlabel="largest nodal displacement (mm)", ylabel="samples")
+    left.legend(frameon=False)
+    every = np.concatenate(list(iterations.values()))
+    bins = np.arange(every.min(initial=0), every.max(initial=1) + 2) - 0.5
+    right.hist(list(iterations.values()), bins=bins, stacked=True, color=_SPLIT_COLOURS)
+    right.set(xlabel="Newton iterations of a sample", ylabel="samples")
+    right.xaxis.get_major_locator().set_params(integer=True)
+
+
+# ------------------------------------------------------------------ the surrogate
+
+
+def surrogate_section(space: Workspace, studio: Studio) -> Section:
+    """Held-out errors, and the median and the worst sample of those kept."""
+    table, arrays = space.folder / "validation.json", space.folder / "validation.npz"
+    if not table.exists() or not arrays.exists():
+        first = "" if space.twin.exists() else "softtwin train organ.toml, then "
+        raise _Missing(f"There are no held-out errors yet: {first}softtwin validate organ.toml.")
+    body = _body(space)
+    found = _arrays(arrays)
+    names = ("displacements_true", "displacements_predicted")
+    true, predicted = (_fields(body, f"validation.npz: {name}", found[name]) for name in names)
+    errors, sizes = found["errors_mean_m"], found["sizes_m"]
+    kept = np.linalg.norm(predicted - true, axis=2).mean(axis=1)
+    order = np.argsort(kept)
+    chosen = {"median": order[(len(order) - 1) // 2], "worst": order[-1]}
+    return {
+        "table": without_paths(str(json.loads(table.read_text()).get("table", "")), space),
+        "mean": float(errors.mean()),
+        "largest_mean": float(errors.max()),
+        "size": float(sizes.mean()),
+        "count": len(errors),
+        "rows": [_prediction(studio, body, name, true[i], predicted[i]) for name, i in chosen.items()],
+        "chart": chart(lambda sheet: _draw_errors(sheet, sizes, errors), "error of each held-out sample over its size"),
+    }
+
+
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    # Opened here: of a damaged file numpy would leave its own open.
+    with path.open("rb") as file, np.load(file) as found:
+        return dict(found)
+
+
+def _fields(body: Body, name: str, values: Floats) -> Floats:
+    if values.ndim != 3 or values.shape[1:] != body.points.shape or not len(values):
+        raise ValueError(f"{name}: expected shape (samples, {len(body.points)}, 3), got {values.shape}; make it again.")
+    return values
+
+
+def _prediction(studio: Studio, body: Body, name: str, true: Floats, predicted: Floats) -> Section:
+    errors = np.linalg.norm(predicted - true, axis=1)
+    limit = float(np.linalg.norm(true, axis=1).max())
+    view = view_of(camera_side(body), [body.points, body.points + true, body.points + predicted])
+    columns = {"true": (true, None), "predicted": (predicted, None), "error": (predicted, errors)}
+    pictures = [
+        studio.picture(view, _coloured(body, field, limit, error), f"{name} sample, {words}", 480)
+        for words, (field, error) in columns.items()
+    ]
+    figures = {"limit": limit, "error_limit": float(errors.max()), "error": float(errors.mean())}
+    return {"name": name, "pictures": pictures, **figures}
+
+
+def _coloured(body: Body, field: Floats, limit: float, errors: Floats | None) -> list[Layer]:
+    """The deformed body coloured by its displacement, or by the errors if given, and its outline at rest."""
+    rest = Layer(body.points, body.boundary, "#8a929c", style="outline")
+    if errors is None:
+        return [Layer(body.points + field, body.boundary, values=np.linalg.norm(field, axis=1), limit=limit), rest]
+    return [Layer(body.points + field, body.boundary, values=errors, limit=float(errors.max()), colours=_ERROR), rest]
+
+
+def _draw_errors(sheet: Figure, sizes: Floats, errors: Floats) -> None:
+    axes = sheet.subplots()
+    axes.scatter(1e3 * sizes, 1e3 * errors, s=18, color=_SPLIT_COLOURS[0], alpha=0.8, linewidths=0)
+    axes.set(xlabel="largest true displacement of the sample (mm)", ylabel="mean nodal error (mm)")
+    if errors.min() > 0 and errors.max() > 30 * errors.min():
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+    else:
+        axes.set_ylim(bottom=0.0)
+    axes.grid(alpha=0.25)
+
+
+# ------------------------------------------------------------------ the registration
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where the organ is taken to be: before registration, or as a model found it.
+
+    Args:
+        name: `before`, `surrogate` or `reference`.
+        displacement: (n, 3), metres.
+        forces: (n, 3), newtons; none before registration.
+        row: what registration.json says of it.
+    """
+
+    name: str
+    displacement: Floats
+    forces: Floats | None
+    row: Mapping[str, Any]
+
+
+def registration_section(space: Workspace, studio: Studio) -> Section:
+    """The demo: where the cloud, the organ and its tumour are before and after, with either model."""
+    folder = space.folder / "demo"
+    if not (folder / "cloud.npy").exists() or not (folder / "truth.npy").exists():
+        raise _Missing(
+            "There is no registration demo: softtwin quickstart makes one; "
+            "softtwin register TWIN CLOUDS... registers clouds of your own."
+        )
+    body = _body(space)
+    cloud = np.load(folder / "cloud.npy")
+    truth = _fields(body, "truth.npy", np.load(folder / "truth.npy")[None])[0]
+    models = [name for name in ("surrogate", "reference") if (folder / f"{name}.npz").exists()]
+    found = [_read_state(folder, name, body) for name in models]
+    states = [_State("before", np.zeros_like(truth), None, {}), *found]
+    targets = target_points(body)
+    shown = [name for name in targets if _TUMOUR.search(name)] or list(targets)
+    rows = [_figures(body, state, truth, cloud, targets) for state in states]
+    return {
+        "points": len(cloud),
+        "largest": float(np.linalg.norm(truth, axis=1).max()),
+        "rows": rows,
+        "targets": list(targets),
+        "shown": shown,
+        "force": _true_force(folder, found),
+        "pictures": _wide_pictures(studio, body, states, truth, cloud, shown),
+        "closeups": _closeups(studio, body, states, truth, shown),
+        "across": _compared(found, targets),
+        "legend": [(ORGAN, "organ"), (FOUND, ", ".join(shown)), (CLOUD, "cloud"), (TRUTH, "truth (outline, mesh)")],
+    }
+
+
+def _read_state(folder: Path, name: str, body: Body) -> _State:
+    arrays = _arrays(folder / f"{name}.npz")
+    displacement = _fields(body, f"{name}.npz: displacement", arrays["displacement"][None])[0]
+    record = folder / name / "registration.json"
+    row = json.loads(record.read_text())["frames"][0] if record.exists() else {}
+    return _State(name, displacement, arrays["forces"], row)
+
+
+def _true_force(folder: Path, found: Sequence[_State]) -> Floats | None:
+    if not found:
+        return None
+    forces = _arrays(folder / f"{found[0].name}.npz").get("true_forces")
+    return None if forces is None else np.asarray(forces.sum(axis=0))
+
+
+def _figures(body: Body, state: _State, truth: Floats, cloud: Floats, targets: Mapping[str, Embedding]) -> Section:
+    force = None if state.forces is None else state.forces.sum(axis=0)
+    return {
+        "name": state.name,
+        "nodes": nodal_errors(state.displacement, truth),
+        "targets": _apart(targets, state.displacement, truth),
+        "distance": _cloud_distance(body, state.displacement, cloud),
+        "force": force,
+        "deviation": state.row.get("net_force_deviation_N"),
+        "seconds": state.row.get("seconds"),
+        "iterations": state.row.get("iterations"),
+        "reason": state.row.get("reason", ""),
+    }
+
+
+def _apart(targets: Mapping[str, Embedding], first: Floats, second: Floats) -> dict[str, float]:
+    """Mean distance of each target's points between two displacements, metres."""
+    return {name: nodal_errors(to.displace(first), to.displace(second)).mean for name, to in targets.items()}
+
+
+def _cloud_distance(body: Body, displacement: Floats, cloud: Floats) -> float:
+    """Root mean square distance of the cloud to the observed side, metres."""
+    objective = CloudObjective(body, body.surfaces.get("observed"))
+    return float(np.sqrt(np.mean(objective.match(displacement[objective.nodes], cloud).distances ** 2)))
+
+
+def _wide_pictures(
+    studio: Studio, body: Body, states: Sequence[_State], truth: Floats, cloud: Floats, shown: Sequence[str]
+) -> list[Picture]:
+    view = view_of(camera_side(body), [body.points, body.points + truth, cloud])
+    true = carried(body, truth)
+    pictures = []
+    for state in states:
+        moved = carried(body, state.displacement)
+        layers = [
+            Layer(body.points + state.displacement, body.boundary, ORGAN, 0.35),
+            *(Layer(moved[name].points, moved[name].triangles, FOUND) for name in shown),
+            *(Layer(true[name].points, true[name].triangles, TRUTH, style="wireframe") for name in shown),
+            Layer(body.points + truth, body.boundary, TRUTH, style="outline"),
+            Layer(cloud, colour=CLOUD, ball=0.009),
+        ]
+        pictures.append(studio.picture(view, layers, _state_words(state), 600))
+    return pictures
+
+
+def _closeups(
+    studio: Studio, body: Body, states: Sequence[_State], truth: Floats, shown: Sequence[str]
+) -> list[Picture]:
+    if not shown:
+        return []
+    true = carried(body, truth)
+    moved = [carried(body, state.displacement) for state in states]
+    view = view_of(camera_side(body), [surfaces[name].points for surfaces in (true, *moved) for name in shown], 1.15)
+    return [
+        studio.picture(
+            view,
+            [
+                *(Layer(surfaces[name].points, surfaces[name].triangles, FOUND, 0.8) for name in shown),
+                *(Layer(true[name].points, true[name].triangles, TRUTH, style="wireframe") for name in shown),
+            ],
+            f"{', '.join(shown)} {_state_words(state)}",
+            460,
+        )
+        for state, surfaces in zip(states, moved, strict=True)
+    ]
+
+
+def _state_words(state: _State) -> str:
+    return "before" if state.name == "before" else f"after, with the {state.name}"
+
+
+def _compared(found: Sequence[_State], targets: Mapping[str, Embedding]) -> Section | None:
+    """How far the two models' registrations lie apart, None unless both are there."""
+    if len(found) < 2:
+        return None
+    first, second = found
+    return {
+        "nodes": nodal_errors(first.displacement, second.displacement),
+        "targets": _apart(targets, first.displacement, second.displacement),
+        "force": float(np.linalg.norm((first.forces - second.forces).sum(axis=0))),  # type: ignore[operator]
+    }
+
+
+# ------------------------------------------------------------------ the record
+
+
+def record_section(space: Workspace, studio: Studio) -> Section:
+    """What it takes to make the same again: configuration, versions, times, the twin's card."""
+    times, card = space.folder / "stages.json", space.twin / "surrogate.json"
+    stages = json.loads(times.read_text()) if times.exists() else {}
+    return {
+        "stages": stages,
+        "total": sum(stage["seconds"] for stage in stages.values()),
+        "longest": max((stage["seconds"] for stage in stages.values()), default=0.0) or 1.0,
+        "toml": to_toml(public_config(space.config)),
+        "card": without_paths(card.read_text(), space) if card.exists() else "",
+        "seeds": {"data": space.config.samples.seed, "training": space.config.training.seed},
+        "versions": _versions(),
+    }
+
+
+def public_config(config: Config) -> Config:
+    """The configuration with files named without their folders where these are absolute."""
+    return Config.model_validate(_named(config.model_dump()))
+
+
+def _named(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _named(entry) for key, entry in value.items()}
+    return PurePath(value).name if isinstance(value, str) and PurePath(value).is_absolute() else value
+
+
+def _versions() -> dict[str, str]:
+    packages = ("softtwin", "numpy", "scipy", "torch", "vtk", "pyvista", "matplotlib")
+    found = {dist: _version(dist) for dist in packages}
+    return {"python": platform.python_version(), **{name: version for name, version in found.items() if version}}
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+_SECTIONS: Mapping[str, Callable[[Workspace, Studio], Section]] = {
+    "organ": organ_section,
+    "modes": modes_section,
+    "data": data_section,
+    "surrogate": surrogate_section,
+    "registration": registration_section,
+    "record": record_section,
+}

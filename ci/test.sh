@@ -6,7 +6,7 @@ set -uo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 cd "$ROOT"
 bash ci/setup.sh || exit 1
-export PATH="$VENV/bin:$PATH"
+export PATH="$VENV/bin:$PATH" PYTHONUNBUFFERED=1 # unbuffered, or a test that forks prints the lines before it twice
 LOGS="$ROOT/build/ci"
 rm -rf "$LOGS" && mkdir -p "$LOGS"
 SKIPPED=77

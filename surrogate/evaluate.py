@@ -47,7 +47,7 @@ DEFINITIONS = (
     ("thesis_error", "e_thesis", "|u - u*|_2 / number of nodes", "m"),
     ("relative_error", "rel", "|u - u*|_2 / |u*|_2", "1"),
     ("displacement_norm", "u_2", "|u*|_2 over all nodal components", "m"),
-    ("gradient_cosine", "cos", "cosine of J^T g with the reference's K(u*)^-1 g at the loaded nodes, stored probes g", "1"),
+    ("gradient_cosine", "cos", "cosine of J^T g with the reference's K(u*)^-1 g at the loaded nodes, g stored", "1"),
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +31,7 @@ class Perceptron(nn.Module):
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
         sizes = (inputs, outputs, outputs, outputs, outputs)
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True))
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
 
     def forward(self, forces: Tensor) -> Tensor:
         """Scaled displacements for scaled forces."""
@@ -94,6 +95,9 @@ class PerceptronLesson(nn.Module):
     """
 
     forces: Tensor
+    displacements: Tensor
+    validation_forces: Tensor
+    validation_displacements: Tensor
 
     def __init__(self, train: Samples, validation: Samples) -> None:
         super().__init__()
@@ -123,6 +127,7 @@ class PerceptronLesson(nn.Module):
         first, *hidden, last = (
             (layer.weight.detach().double().cpu().numpy(), layer.bias.detach().double().cpu().numpy())
             for layer in self.network.layers
+            if isinstance(layer, nn.Linear)
         )
         weights = {"first.bias": first[1]}
         for i, (weight, bias) in enumerate(hidden):

@@ -139,7 +139,10 @@ class Surrogate:
         return displacement.reshape(-1, 3)
 
     def pullback(self, cotangent: ArrayLike) -> Floats:
-        """J^T g, (n, 3), at the last state for a gradient g with respect to the displacement, (n, 3); zero where no load acts.
+        """Gradient with respect to the forces, (n, 3): J^T g at the last state, zero at nodes that never carry load.
+
+        Args:
+            cotangent: g, gradient with respect to the displacement, (n, 3).
 
         Raises:
             ValueError: another shape, or numbers that are not finite.
@@ -205,8 +208,8 @@ class Surrogate:
         bad = self._idle[sizes[self._idle] > 0.0]
         if len(bad):
             raise ValueError(
-                f"Surrogate.{name}: expected forces at the {len(self.frame.loaded)} nodes that carried load in training "
-                f"(surrogate.frame.loaded), got some at {len(bad)} other nodes, first {bad[:5].tolist()}."
+                f"Surrogate.{name}: expected forces at the {len(self.frame.loaded)} nodes that carried load in "
+                f"training (surrogate.frame.loaded), got some at {len(bad)} other nodes, first {bad[:5].tolist()}."
             )
 
 
@@ -234,8 +237,7 @@ class Restricted:
     ) -> None:
         self._core = core
         self._encode, self._linear, self._decode, self._offset = encode, linear, decode, offset
-        self._linear_rows, self._decode_rows = np.ascontiguousarray(linear[picked]), np.ascontiguousarray(decode[picked])
-        self._offset_rows = offset[picked]
+        self._linear_rows, self._decode_rows, self._offset_rows = linear[picked], decode[picked], offset[picked]
 
     @property
     def coefficient_count(self) -> int:

@@ -141,7 +141,7 @@ def _leading_iterated(rows: Floats, count: int) -> tuple[Floats, Floats]:
     for _ in range(6):
         basis = np.linalg.qr(rows.T @ (rows @ basis))[0]
     _, values, turn = np.linalg.svd(rows @ basis, full_matrices=False)
-    return values[:count] ** 2, basis @ turn[:count].T
+    return np.square(values[:count]), basis @ turn[:count].T
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,9 +173,7 @@ class ReducedBasis:
         return np.concatenate([coordinates @ turn.T for turn in self.turns])
 
 
-def build_basis(
-    corrections: Floats, body: Body, loaded: Ints, group: Sequence[Symmetry], count: int
-) -> ReducedBasis:
+def build_basis(corrections: Floats, body: Body, loaded: Ints, group: Sequence[Symmetry], count: int) -> ReducedBasis:
     """The reduced basis of weighted corrections (s, n, 3): see `correction_modes`."""
     modes = correction_modes(corrections, body.fixed, group, count)
     fields = modes.T.reshape(-1, *body.points.shape)
@@ -318,7 +316,17 @@ class ReducedLesson(nn.Module):
         ValueError: no training samples, or none that differ from the linear response.
     """
 
+    loads: Tensor
     targets: Tensor
+    weights: Tensor
+    cotangents: Tensor
+    adjoints: Tensor
+    adjoint_weights: Tensor
+    metric: Tensor
+    validation_loads: Tensor
+    validation_targets: Tensor
+    validation_rest: Tensor
+    validation_weights: Tensor
 
     def __init__(
         self,
@@ -363,7 +371,7 @@ class ReducedLesson(nn.Module):
 
     @torch.no_grad()
     def error(self) -> float:
-        """Mean over the validation samples of the root of the semi-relative error, the part outside the modes included."""
+        """Mean over the validation samples of the root of the semi-relative error, outside the modes too."""
         missed = (self.network(self.validation_loads) - self.validation_targets).square().sum(dim=1)
         return float(((missed + self.validation_rest) * self.validation_weights).sqrt().mean())
 
@@ -375,7 +383,9 @@ class ReducedLesson(nn.Module):
         linear = self.response.apply(train.forces).reshape(len(train), -1) @ self.basis.modes
         importance = _deviation(self.basis.images(linear))
         # between whitening, which drowns in the small coordinates, and importance, which starves them
-        scale = (importance / importance.max()) ** 0.25 / _deviation(self.loads.double().numpy())
+        spread = _deviation(self.loads.double().numpy())
+        spread = np.maximum(spread, 1e-3 * spread.max())  # a direction hardly ever loaded must not be blown up
+        scale = (importance / importance.max()) ** 0.25 / spread
         size = float(self.targets.square().mean().sqrt())
         self.network = ReducedNetwork(_tensor(scale), size, width, depth)
 
@@ -434,9 +444,8 @@ def _sizes(fields: Floats) -> Floats:
 
 
 def _deviation(coordinates: Floats) -> Floats:
-    """Root mean square of each coordinate about zero (loads come in both signs), never zero."""
-    values = np.sqrt((coordinates**2).mean(axis=0))
-    return np.maximum(values, 1e-12 * max(float(values.max()), 1e-300))
+    """Root mean square of each coordinate about zero: loads come in both signs."""
+    return np.sqrt((coordinates**2).mean(axis=0))
 
 
 def _tensor(values: Floats) -> Tensor:

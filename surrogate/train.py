@@ -1,4 +1,4 @@
-"""Training through Lightning: a plan in, a frozen surrogate out; every round leaves a checkpoint that goes on exactly."""
+"""Training through Lightning: a plan in, a frozen surrogate out; every round leaves a checkpoint to go on from."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from typing import Any, Literal
 import lightning
 import numpy as np
 import torch
+from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from torch import Tensor
 from tqdm import tqdm
@@ -84,9 +85,7 @@ class TrainingPlan:
 
     def __post_init__(self) -> None:
         if self.architecture not in _RATES:
-            raise ValueError(
-                f"TrainingPlan.architecture: expected one of {sorted(_RATES)}, got {self.architecture!r}."
-            )
+            raise ValueError(f"TrainingPlan.architecture: expected one of {sorted(_RATES)}, got {self.architecture!r}.")
         for name in ("modes", "width", "depth", "epochs", "batch", "samples"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -174,7 +173,7 @@ def fingerprint(data: DataSet, splits: dict[str, Samples]) -> str:
     for samples in splits.values():
         arrays += [samples.draws, samples.forces, samples.displacements, samples.probes, samples.adjoints]
     for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 
@@ -197,7 +196,8 @@ def _step_time(lesson: Lesson, plan: TrainingPlan, batch: int) -> float:
     start = {name: value.clone() for name, value in lesson.network.state_dict().items()}
     optimizer = _optimizer(lesson, plan, rate=1e-9)
     numbers = torch.arange(batch, device=next(lesson.network.parameters()).device)
-    times, end = [], time.perf_counter() + min(3.0, 0.05 * plan.seconds)
+    times: list[float] = []
+    end = time.perf_counter() + min(3.0, 0.05 * plan.seconds)
     while len(times) < 8 or (time.perf_counter() < end and len(times) < 200):
         began = time.perf_counter()
         optimizer.zero_grad()
@@ -319,9 +319,7 @@ class _Progress(Callback):
     """One bar over all steps: rate, time left, validation error; quiet when not a terminal."""
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: Any) -> None:
-        self._bar = tqdm(
-            total=pl_module.steps, initial=trainer.global_step, desc="training", unit="step", disable=None
-        )
+        self._bar = tqdm(total=pl_module.steps, initial=trainer.global_step, desc="training", unit="step", disable=None)
 
     def on_train_batch_end(self, trainer: lightning.Trainer, pl_module: Any, *_: Any) -> None:
         self._bar.update()
@@ -349,6 +347,7 @@ def _fit(course: Course, path: Path, resume: bool) -> None:
         trainer = lightning.Trainer(
             accelerator="gpu" if _device() == "cuda" else "cpu",
             devices=1,
+            plugins=LightningEnvironment(),  # else it looks for MPI and starts it
             max_epochs=course.rounds,
             reload_dataloaders_every_n_epochs=1,
             callbacks=[keeper, _Progress()],

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
 from softtwin.meshes.body import Body
 from softtwin.meshes.metrics import HEXAHEDRON_EDGES
 from softtwin.meshes.shapes import beam
@@ -58,7 +59,8 @@ class ClosedForm:
         energy = stretch**2 * (load.ravel() @ linear)
         factor = 2.0 * GAMMA / (1.0 + 3.0 * GAMMA * energy)
         back = self.inverse @ cotangent.ravel()
-        return ((back - factor * displacement * (displacement @ cotangent.ravel())) / (1.0 + GAMMA * energy)).reshape(-1, 3)
+        corrected = back - factor * displacement * (displacement @ cotangent.ravel())
+        return (corrected / (1.0 + GAMMA * energy)).reshape(-1, 3)
 
 
 def write_data_set(path: Path, body: Body, counts: dict[str, int] = COUNTS, poison: str = "") -> DataSet:
@@ -129,7 +131,7 @@ def make_data(small_beam: Body, tmp_path: Path) -> Maker:
 
 @pytest.fixture(scope="session")
 def small_plan() -> TrainingPlan:
-    return TrainingPlan(modes=6, width=32, depth=2, batch=32, epochs=200)
+    return TrainingPlan(modes=6, width=32, depth=2, batch=32, epochs=30)
 
 
 @pytest.fixture(scope="session")
@@ -139,7 +141,7 @@ def reduced(data: DataSet, small_plan: TrainingPlan) -> Surrogate:
 
 @pytest.fixture(scope="session")
 def perceptron(data: DataSet) -> Surrogate:
-    return train(data, TrainingPlan(architecture="mlp", batch=32, epochs=60))
+    return train(data, TrainingPlan(architecture="mlp", batch=32, epochs=30))
 
 
 @pytest.fixture(params=["reduced", "perceptron"])

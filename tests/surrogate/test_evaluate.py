@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from softtwin.meshes.shapes import beam
 from softtwin.reference.dataset import DataSet
 from softtwin.surrogate.evaluate import DEFINITIONS, cosine, evaluate, registration_cosines, spread, table

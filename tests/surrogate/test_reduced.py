@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.dataset import DataSet
@@ -97,9 +98,7 @@ def test_plain_arrays_compute_what_the_network_computes(data: DataSet) -> None:
     assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
 
 
-def test_reduced_loss_is_the_full_loss_up_to_a_constant(
-    data: DataSet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reduced_loss_is_the_full_loss_up_to_a_constant(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
     """Differences of the loss between two networks agree with those of the loss in all 3n unknowns."""
     lesson = _lesson(data, use_symmetries=False)
     samples = data.samples("train")
@@ -108,7 +107,7 @@ def test_reduced_loss_is_the_full_loss_up_to_a_constant(
     reduced, full = [], []
     for scale in (0.3, 1.0):
         lesson.network.output_scale.fill_(scale)
-        reduced.append(float(lesson.loss(batch)))
+        reduced.append(lesson.loss(batch).item())
         full.append(_full_loss(data, lesson))
     assert abs(reduced[1] - reduced[0]) > 1e-2 * reduced[1]
     # float32 sums of losses of this size

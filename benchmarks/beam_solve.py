@@ -1,0 +1,85 @@
+"""One equilibrium of the thesis's beam: 304 hexahedra, tip deflection 0.3 m, and 100 modal loads of the data set's kind.
+
+    python benchmarks/beam_solve.py
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+from record import write
+from scipy.optimize import brentq
+from threadpoolctl import threadpool_limits
+
+from softtwin.meshes.shapes import beam
+from softtwin.reference.equilibrium import Problem
+from softtwin.reference.loads import LoadPlan, draw_load
+from softtwin.reference.materials import NeoHookean
+from softtwin.reference.modes import eigenmodes
+
+YOUNG_MODULUS, POISSON_RATIO, AMPLITUDE = 5000.0, 0.45, 0.03
+WANTED = 0.3
+
+
+def tip_load(problem: Problem, newtons: float) -> NDArray[np.float64]:
+    """A transverse force spread evenly over the nodes of the tip."""
+    forces = np.zeros_like(problem.body.points)
+    tip = problem.body.node_sets["tip"]
+    forces[tip, 2] = newtons / len(tip)
+    return forces
+
+
+def deflection(problem: Problem, newtons: float) -> float:
+    """How far the centre of the tip moves, metres."""
+    tip = problem.body.node_sets["tip"]
+    return float(np.linalg.norm(problem.solve(tip_load(problem, newtons)).displacement[tip].mean(axis=0)))
+
+
+def timed(problem: Problem, forces: NDArray[np.float64], repeats: int, stability: bool) -> float:
+    """Median wall time of a solve from rest, milliseconds."""
+    seconds = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        problem.solve(forces, stability=stability)
+        seconds.append(time.perf_counter() - begin)
+    return 1e3 * float(np.median(seconds))
+
+
+def main() -> None:
+    with threadpool_limits(1), Problem(beam(), NeoHookean(YOUNG_MODULUS, POISSON_RATIO)) as problem:
+        newtons = brentq(lambda f: deflection(problem, f) - WANTED, 0.5, 3.0, xtol=1e-4)
+        forces = tip_load(problem, newtons)
+        state = problem.solve(forces)
+        figures = {
+            "tip_force_N": newtons,
+            "tip_deflection_m": deflection(problem, newtons),
+            "iterations": state.iterations,
+            "factorisations": state.factorisations,
+            "median_ms": timed(problem, forces, 50, stability=False),
+            "median_with_stability_ms": timed(problem, forces, 50, stability=True),
+        }
+        shapes = eigenmodes(problem, 10).shapes
+        rng = np.random.default_rng(0)
+        rows = []
+        for _ in range(100):
+            load = AMPLITUDE * draw_load(problem.body, shapes, LoadPlan(radius=(0.055, 0.64)), rng)
+            begin = time.perf_counter()
+            state = problem.solve(load, stability=False)
+            rows.append((1e3 * (time.perf_counter() - begin), state.iterations, state.factorisations, state.load_steps))
+        milliseconds, iterations, factorisations, steps = np.array(rows).T
+        figures["modal_loads"] = {
+            "count": len(rows),
+            "in_one_load_step": int((steps == 1).sum()),
+            "median_ms": float(np.median(milliseconds)),
+            "mean_ms": float(milliseconds.mean()),
+            "mean_iterations": float(iterations.mean()),
+            "mean_factorisations": float(factorisations.mean()),
+        }
+    print(figures)
+    write("beam_solve", figures)
+
+
+if __name__ == "__main__":
+    main()

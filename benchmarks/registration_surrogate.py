@@ -1,0 +1,108 @@
+"""Registration of the real liver with a surrogate: the same frames, truth and metrics as with the reference.
+
+    python benchmarks/registration_surrogate.py [--ranks 2] [--seconds 300] [--frames 50]
+
+Makes the data set under benchmarks/runs/liver where it is not there, and trains the twin.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequence
+from record import write
+from registration_reference import summary
+from threadpoolctl import threadpool_limits
+
+from softtwin.app.build import Workspace, generate_in_parallel
+from softtwin.app.chain import prepare
+from softtwin.app.config import Config
+from softtwin.app.learn import train_stage, validate_stage
+from softtwin.meshes.files import write_body
+from softtwin.registration.control import nodal_control
+from softtwin.registration.forward import ForwardModel
+from softtwin.registration.minimise import Registrar, RegistrationOptions
+from softtwin.registration.objective import CloudObjective
+from softtwin.registration.sequence import register_sequence
+
+RUNS = Path(__file__).parent / "runs"
+
+
+def liver_config(seconds: float, ranks: int) -> Config:
+    """Loads on the zones that the sequences allow, along paths of growing size."""
+    return Config.model_validate(
+        {
+            "folder": ".",
+            "material": {"young_modulus": YOUNG_MODULUS, "poisson_ratio": POISSON_RATIO},
+            "loads": {"zones": list(SEQUENCES), "patches": 1, "radius": (0.25, 0.8), "displacement": 0.07},
+            "samples": {"train": 1536, "validation": 96, "test": 192, "block": 8, "path": 8, "ranks": ranks},
+            "training": {"seconds": seconds},
+        }
+    )
+
+
+def make_twin(seconds: float, ranks: int, folder: Path) -> Workspace:
+    """The liver's twin; a data set that is there is not made again."""
+    space = prepare(liver_config(seconds, ranks), folder)
+    write_body(space.body, liver())
+    generate_in_parallel(folder / "organ.toml", ranks)
+    train_stage(space)
+    print(validate_stage(space))
+    return space
+
+
+def run(data: Sequence, model: ForwardModel, frames: int, noise: float, smoothness: float) -> list[dict[str, float]]:
+    """Errors, forces and times of every frame."""
+    body = model.body
+    control = nodal_control(body, data.zone, force_scale=0.1, smoothness=smoothness)
+    registrar = Registrar(model, CloudObjective(body, body.surfaces["observed"]), control, RegistrationOptions(noise=noise))
+    rows = []
+    for i, result in enumerate(register_sequence(registrar, data.clouds[:frames])):
+        errors = 1e3 * np.linalg.norm(result.displacement - (data.positions[i] - body.points), axis=1)
+        true = data.net_forces[i]
+        difference = float(np.linalg.norm(result.net_force - true))
+        rows.append(
+            {
+                "frame": i,
+                "tre_mm": errors.mean(),
+                "tre_p95_mm": np.quantile(errors, 0.95),
+                "tre_max_mm": errors.max(),
+                "force_error_N": difference,
+                "force_error": difference / float(np.linalg.norm(true)),
+                "rms_distance_mm": 1e3 * result.rms_distance,
+                "seconds": result.seconds,
+                "iterations": len(result.trace),
+            }
+        )
+    return rows
+
+
+def main() -> None:
+    from softtwin.surrogate.predictor import load
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--ranks", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--frames", type=int, default=50)
+    parser.add_argument("--noise", type=float, default=5e-4)
+    parser.add_argument("--smoothness", type=float, default=0.015)
+    parser.add_argument("--folder", type=Path, default=RUNS / "liver")
+    parser.add_argument("--twin", type=Path, help="register with this finished twin instead of making one")
+    arguments = parser.parse_args()
+    twin = arguments.twin or make_twin(arguments.seconds, arguments.ranks, arguments.folder).twin
+    body = liver()
+    model = load(twin, body)
+    figures = {"noise": arguments.noise, "smoothness": arguments.smoothness, "sequences": {}}
+    figures["held_out"] = model.card.get("held_out")
+    with threadpool_limits(1):
+        for name in SEQUENCES:
+            rows = run(sequence(name), model, arguments.frames, arguments.noise, arguments.smoothness)
+            figures["sequences"][name] = {"summary": summary(rows), "frames": rows}
+            print(name, {key: round(value, 4) for key, value in summary(rows).items()}, flush=True)
+    write("registration_surrogate", figures)
+
+
+if __name__ == "__main__":
+    main()

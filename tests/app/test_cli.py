@@ -1,0 +1,243 @@
+"""The command line as a user meets it: help, good runs of single stages, and what is said of bad input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from softtwin.app.build import make_body
+from softtwin.app.cli import main
+from softtwin.app.config import BodySection, Config, to_toml
+from softtwin.meshes.body import Body
+from softtwin.meshes.clouds import partial_view
+from softtwin.meshes.files import read_body, write_body
+from softtwin.meshes.shapes import beam
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object, code: int = 0) -> str:
+    """Output and errors of a command that ends with the code."""
+    try:
+        main([str(argument) for argument in arguments])
+        ended = 0
+    except SystemExit as stop:
+        ended = int(stop.code or 0)
+    captured = capsys.readouterr()
+    assert ended == code, captured.out + captured.err
+    return captured.out + captured.err
+
+
+@pytest.fixture
+def sphere(tmp_path: Path) -> Path:
+    path = tmp_path / "sphere_mm.stl"
+    trimesh.creation.icosphere(subdivisions=3, radius=50.0).export(path)
+    return path
+
+
+@pytest.fixture
+def cap(tmp_path: Path) -> Path:
+    """Points of the sphere's lower cap, in millimetres."""
+    points = trimesh.creation.icosphere(subdivisions=3, radius=50.0).vertices
+    path = tmp_path / "cap.txt"
+    np.savetxt(path, points[points[:, 2] < -35.0])
+    return path
+
+
+@pytest.fixture
+def twin(tmp_path: Path) -> Path:
+    """A twin that the reference can register: body and configuration, no network."""
+    folder = tmp_path / "twin"
+    folder.mkdir()
+    write_body(folder / "body.vtu", beam((6, 2, 2), (0.6, 0.2, 0.2), "tetrahedron"))
+    (folder / "organ.toml").write_text(to_toml(Config()))
+    return folder
+
+
+def cloud(folder: Path, body: Body, shift: float = 0.0) -> Path:
+    bent = np.zeros_like(body.points)
+    bent[:, 2] = 0.05 * body.points[:, 0] ** 2
+    points = partial_view(body, bent, (0.3, 0.4, 1.0), 200, 1e-4, np.random.default_rng(0)) + shift
+    path = folder / f"cloud_{shift}.npy"
+    np.save(path, points)
+    return path
+
+
+@pytest.mark.parametrize("command", ["", "build", "register", "generate", "mesh", "train", "validate", "report", "quickstart", "doctor", "config"])
+def test_help_reads(capsys, command: str) -> None:
+    text = run(capsys, *command.split(), "--help")
+    assert "Usage:" in text and len(text.splitlines()) > 4
+
+
+def test_the_main_help_says_what_it_is_not(capsys) -> None:
+    assert "not a medical device" in run(capsys, "--help")
+
+
+def test_config_writes_a_file_that_mesh_takes(capsys, tmp_path: Path) -> None:
+    text = run(capsys, "config").replace('source = "liver-phantom"', 'source = "beam"')
+    (tmp_path / "organ.toml").write_text(text)
+    said = run(capsys, "mesh", tmp_path / "organ.toml")
+    assert "500 nodes" in said
+    assert len(read_body(tmp_path / "twin-run" / "body.vtu").points) == 500
+    assert "mesh" in json.loads((tmp_path / "twin-run" / "stages.json").read_text())
+
+
+def test_a_surface_in_millimetres_becomes_a_body_in_metres(sphere: Path, cap: Path) -> None:
+    section = BodySection(source=str(sphere), unit="mm", fixed=str(cap), nodes=300)
+    body = make_body(section, Path("."))
+    assert body.volume == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=0.05)  # an inscribed polyhedron is smaller
+    assert body.points[body.fixed, 2].max() < -0.02
+
+
+def test_lone_listed_nodes_are_not_an_attachment() -> None:
+    """An attachment is a surface: a listed node without a whole listed triangle is left free."""
+    bare = beam((6, 2, 2), (0.6, 0.2, 0.2), "tetrahedron")
+    from softtwin.app.build import _attached
+
+    lone = int(bare.node_sets["tip"][0])
+    assert np.array_equal(_attached(bare, np.append(bare.fixed, lone)), bare.fixed)
+
+
+def build(capsys, tmp_path: Path, *arguments: object) -> str:
+    return run(capsys, "build", *arguments, "--output", tmp_path / "out", code=2)
+
+
+def test_no_fixed_nodes_is_said_with_the_flag(capsys, tmp_path, sphere) -> None:
+    assert "Give --fixed FILE" in build(capsys, tmp_path, sphere, "--unit", "mm", "--nodes", 200)
+
+
+def test_a_fixed_set_far_from_the_boundary_is_said_with_the_distance(capsys, tmp_path, sphere) -> None:
+    np.savetxt(tmp_path / "far.txt", np.full((5, 3), 300.0) + np.eye(5)[:, :3])
+    said = build(capsys, tmp_path, sphere, "--unit", "mm", "--nodes", 200, "--fixed", tmp_path / "far.txt")
+    assert "no boundary node lies within" in said and "mm away" in said
+
+
+@pytest.mark.filterwarnings("default::softtwin.meshes.files.UnitWarning")
+def test_millimetres_read_as_metres_are_warned_of(capsys, tmp_path, sphere, cap) -> None:
+    said = build(capsys, tmp_path, sphere, "--nodes", 200)
+    assert "warning" in said and "--unit mm" in said and "100" in said
+
+
+def test_an_open_surface_is_refused(capsys, tmp_path, sphere, cap) -> None:
+    whole = trimesh.load(sphere)
+    whole.update_faces(np.arange(len(whole.faces)) > 20)
+    whole.export(tmp_path / "open.stl")
+    said = build(capsys, tmp_path, tmp_path / "open.stl", "--unit", "mm", "--fixed", cap)
+    assert "open" in said and "repair" in said
+
+
+def test_two_components_are_refused(capsys, tmp_path, sphere, cap) -> None:
+    one = trimesh.load(sphere)
+    two = one.copy()
+    two.apply_translation((200.0, 0.0, 0.0))
+    trimesh.util.concatenate([one, two]).export(tmp_path / "two.stl")
+    said = build(capsys, tmp_path, tmp_path / "two.stl", "--unit", "mm", "--fixed", cap)
+    assert "component" in said and "2" in said
+
+
+def test_a_self_intersecting_surface_is_refused(capsys, tmp_path, sphere, cap) -> None:
+    folded = trimesh.load(sphere)
+    top = folded.vertices[:, 2] > 30.0
+    folded.vertices[top, 2] -= 110.0
+    folded.export(tmp_path / "folded.stl")
+    said = build(capsys, tmp_path, tmp_path / "folded.stl", "--unit", "mm", "--fixed", cap)
+    assert "intersect" in said
+
+
+@pytest.mark.parametrize(("flag", "value", "named"), [("--young-modulus", "-3", "material.young_modulus"), ("--poisson-ratio", "0.5", "material.poisson_ratio")])
+def test_materials_that_cannot_be_are_named(capsys, tmp_path, sphere, flag, value, named) -> None:
+    assert named in build(capsys, tmp_path, sphere, flag, value)
+
+
+def test_a_missing_surface_is_named(capsys, tmp_path) -> None:
+    assert "nothing.stl" in build(capsys, tmp_path, tmp_path / "nothing.stl", "--fixed", tmp_path / "nothing.stl")
+
+
+def test_another_configuration_in_the_same_folder_is_refused(capsys, tmp_path, sphere) -> None:
+    build(capsys, tmp_path, sphere, "--unit", "mm", "--nodes", 200)
+    assert "another configuration" in build(capsys, tmp_path, sphere, "--unit", "mm", "--nodes", 210)
+
+
+def register(capsys, twin: Path, *clouds: Path, code: int = 0) -> str:
+    return run(capsys, "register", twin, *clouds, "--model", "reference", "--output", twin / "found", code=code)
+
+
+def test_the_reference_registers_a_cloud(capsys, twin: Path) -> None:
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    said = register(capsys, twin, cloud(twin, read_body(twin / "body.vtu")))
+    assert "frame   0: cloud to surface" in said and "not a medical device" in said
+    frames = json.loads((twin / "found" / "registration.json").read_text())["frames"]
+    assert frames[0]["rms_distance_m"] < 1e-3 and (twin / "found" / "frame_0000.vtu").exists()
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [(np.empty((0, 3)), "point"), (np.array([[0.1, 0.1, np.nan]] * 9), "finite"), (np.zeros((4, 2)), "(p, 3)")],
+)
+def test_clouds_that_cannot_be_are_refused_with_their_file(capsys, twin: Path, points, message: str) -> None:
+    np.save(twin / "bad.npy", points)
+    said = register(capsys, twin, twin / "bad.npy", code=2)
+    assert "bad.npy" in said and message in said and "Traceback" not in said
+
+
+def test_a_cloud_one_metre_away_is_refused_with_the_distance(capsys, twin: Path) -> None:
+    said = register(capsys, twin, cloud(twin, read_body(twin / "body.vtu"), shift=1.0), code=2)
+    assert " m" in said and "rigid" in said
+
+
+def test_a_bad_cloud_is_found_before_the_first_is_registered(capsys, twin: Path) -> None:
+    good = cloud(twin, read_body(twin / "body.vtu"))
+    np.save(twin / "bad.npy", np.empty((0, 3)))
+    register(capsys, twin, good, twin / "bad.npy", code=2)
+    assert not (twin / "found").exists()
+
+
+def test_a_folder_that_is_no_twin_is_refused(capsys, tmp_path: Path, twin: Path) -> None:
+    good = cloud(twin, read_body(twin / "body.vtu"))
+    shutil.rmtree(twin)
+    twin.mkdir()
+    assert "softtwin build" in run(capsys, "register", twin, good, code=2)
+
+
+def test_a_twin_without_a_network_says_so(capsys, twin: Path) -> None:
+    pytest.importorskip("torch", reason="torch is absent")
+    said = run(capsys, "register", twin, cloud(twin, read_body(twin / "body.vtu")), code=2)
+    assert "surrogate.json" in said and "Traceback" not in said
+
+
+def test_unknown_zones_are_named(capsys, twin: Path) -> None:
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    found = cloud(twin, read_body(twin / "body.vtu"))
+    said = run(capsys, "register", twin, found, "--model", "reference", "--zone", "nowhere", code=2)
+    assert "registration.zone" in said and "nowhere" in said
+
+
+def test_ctrl_c_is_one_line_and_code_130(capsys, monkeypatch) -> None:
+    from softtwin.app import doctor
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(doctor, "checks", interrupted)
+    assert "goes on from there" in run(capsys, "doctor", code=130)
+
+
+def test_a_full_disk_is_said(capsys, monkeypatch) -> None:
+    from softtwin.app import doctor
+
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(doctor, "checks", full)
+    assert "the disk is full" in run(capsys, "doctor", code=2)
+
+
+def test_stages_in_the_wrong_order_say_which_comes_first(capsys, tmp_path: Path) -> None:
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    (tmp_path / "organ.toml").write_text(to_toml(Config()))
+    assert "softtwin mesh" in run(capsys, "generate", tmp_path / "organ.toml", code=2)
+    pytest.importorskip("torch", reason="torch is absent")
+    assert "softtwin generate" in run(capsys, "train", tmp_path / "organ.toml", code=2)

@@ -1,0 +1,374 @@
+"""The report: whole on a full workspace, honest on an empty one, and silent about the machine."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softtwin.app import report
+from softtwin.app.build import Workspace
+from softtwin.app.config import Config
+from softtwin.app.report import (
+    Studio,
+    camera_side,
+    figure,
+    inner_colours,
+    public_config,
+    report_stage,
+    view_of,
+    without_paths,
+)
+from softtwin.meshes.body import Body, Surface
+from softtwin.meshes.files import write_body
+from softtwin.meshes.shapes import beam
+from softtwin.reference.dataset import LinearResponse, create, write_block
+
+SPLITS = {"train": 4, "validation": 2, "test": 2}
+COMMANDS = {
+    "organ": "softtwin mesh",
+    "modes": "softtwin generate",
+    "data": "softtwin generate",
+    "surrogate": "softtwin train",
+    "registration": "softtwin quickstart",
+}
+
+
+class Page(HTMLParser):
+    """What a browser would see: elements with their attributes, and the text outside of style."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self._in_style = False
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        self._in_style = tag == "style"
+
+    def handle_data(self, data: str) -> None:
+        self.text += "" if self._in_style else data
+
+    def handle_endtag(self, tag: str) -> None:
+        self._in_style = False
+
+    def pictures(self) -> list[str]:
+        return [attributes["alt"] or "" for tag, attributes in self.elements if tag == "img"]
+
+
+def box(centre: tuple[float, float, float], half: float) -> Surface:
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    faces = [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ]
+    return Surface(np.array(centre) + half * corners, np.array(faces))
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    plain = beam((6, 2, 2), (0.6, 0.2, 0.2), "tetrahedron")
+    front = plain.boundary[(plain.points[plain.boundary][:, :, 1] == 0).all(axis=1)]
+    inner = {"tumour": box((0.4, 0.1, 0.1), 0.03), "<b>vessel</b>": box((0.2, 0.1, 0.1), 0.02)}
+    return replace(plain, surfaces={"observed": front}, inner=inner)
+
+
+def bends(body: Body, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Smooth displacements that grow from the fixed side, the first the smallest, (count, n, 3)."""
+    shape = body.points[:, :1] ** 2 * np.array([[0.0, 0.1, 0.3]])
+    return np.linspace(0.3, 1.0, count)[:, None, None] * shape
+
+
+def make_data(path: Path, body: Body, blocks: int = 4) -> None:
+    loaded = np.setdiff1d(body.boundary_nodes, body.fixed)[:5]
+    response = LinearResponse(loaded, np.zeros((3 * len(body.points), 15)), np.eye(15))
+    header = {"block": 2, "samples": SPLITS, "versions": {"dolfinx": "0.5.2"}}
+    create(path, header, body, response, bends(body, 3), np.array([0.1, 0.2, 0.3]))
+    for block in range(blocks):
+        arrays: dict[str, Any] = {name: np.zeros(2) for name in ("energy", "residual")}
+        arrays |= {name: np.full(2, 4, dtype=np.int32) for name in ("iterations", "load_steps", "negative_pivots")}
+        arrays |= {"forces": np.zeros((2, 5, 3)), "adjoints": np.zeros((2, 5, 3)), "probes": np.zeros((2, 3))}
+        arrays |= {"displacements": bends(body, 2), "reason": np.array([0, 1 if block == 0 else 0], dtype=np.uint8)}
+        write_block(path, block, arrays)
+
+
+def make_validation(folder: Path, body: Body) -> None:
+    true = bends(body, 3)
+    predicted = true * np.array([1.01, 1.02, 1.05])[:, None, None]
+    errors, sizes = np.linalg.norm(predicted - true, axis=2).mean(axis=1), np.linalg.norm(true, axis=2).max(axis=1)
+    np.savez(
+        folder / "validation.npz",
+        displacements_true=true,
+        displacements_predicted=predicted,
+        errors_mean_m=errors,
+        sizes_m=sizes,
+    )
+    (folder / "validation.json").write_text(
+        json.dumps({"table": f"mean error 1 mm, from {folder.resolve()}/data.zarr"})
+    )
+
+
+def make_demo(folder: Path, body: Body) -> None:
+    folder.mkdir()
+    truth = bends(body, 1)[0]
+    seen = np.unique(body.surfaces["observed"])
+    np.save(folder / "truth.npy", truth)
+    np.save(folder / "cloud.npy", (body.points + truth)[seen])
+    forces = np.zeros_like(body.points)
+    forces[-1] = (0.0, 0.3, 0.4)
+    for name, part in (("surrogate", 0.9), ("reference", 0.99)):
+        np.savez(folder / f"{name}.npz", displacement=part * truth, forces=part * forces, true_forces=forces)
+        row = {"net_force_deviation_N": [0.0, 0.03, 0.04], "seconds": 0.25, "iterations": 7, "reason": "small step"}
+        (folder / name).mkdir()
+        (folder / name / "registration.json").write_text(json.dumps({"frames": [row]}))
+
+
+def workspace(root: Path, **entries: Any) -> Workspace:
+    return Workspace(Config.model_validate({"folder": "run", **entries}), root)
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory: pytest.TempPathFactory, body: Body) -> Workspace:
+    root = tmp_path_factory.mktemp("full")
+    space = workspace(
+        root,
+        body={
+            "source": str(root / "scans" / "<i>liver & co.stl"),
+            "fixed": "veins.ply",
+            "inner": {"tumour": str(root / "t.stl")},
+        },
+    )
+    space.folder.mkdir()
+    write_body(space.body, body)
+    make_data(space.data, body)
+    make_validation(space.folder, body)
+    make_demo(space.folder / "demo", body)
+    (space.folder / "stages.json").write_text(json.dumps({"mesh": {"seconds": 5.0}, "generate": {"seconds": 45.0}}))
+    return space
+
+
+@pytest.fixture(scope="module")
+def page(full: Workspace) -> Page:
+    if problem := report.rendering_problem():
+        pytest.skip(problem)
+    return Page(report_stage(full))
+
+
+@pytest.fixture
+def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "rendering_problem", lambda: "no driver here")
+
+
+def test_full_report_has_a_picture_of_everything(page: Page, full: Workspace) -> None:
+    words = page.pictures()
+    organ, modes, samples, charts, registration = 3, 3, 6, 2, 6
+    assert len(words) == organ + modes + samples + charts + registration
+    assert all(words)
+    assert "There is no" not in page.text
+    assert (full.folder / "report.html").stat().st_size < 6e6
+
+
+def test_pictures_are_not_empty(body: Body) -> None:
+    if problem := report.rendering_problem():
+        pytest.skip(problem)
+    view = view_of(camera_side(body), [body.points])
+    image = report._render(view, report.organ_layers(body), 200)
+    assert image.shape[1:] == (200, 4)
+    covered = (image[:, :, 3] > 0).mean()
+    assert 0.2 < covered < 0.95  # the body is in the middle of a transparent ground
+
+
+def test_figures_are_those_of_the_files(page: Page) -> None:
+    text = " ".join(page.text.split())
+    assert "7 equilibria accepted" in text
+    assert "1 not converged" in text
+    # The surrogate was given 90 % of the truth, the reference 99 %: their forces are off by as much.
+    assert "0.050 N (10 %)" in text
+    assert "0.005 N (1 %)" in text
+    assert "0.450 ± 0.050" in text
+    assert "50 s" in text  # all stages together
+
+
+def test_target_errors_before_and_after(full: Workspace, body: Body) -> None:
+    section = report.registration_section(full, Studio("no pictures"))
+    before, surrogate, reference = (row["targets"]["tumour"] for row in section["rows"])
+    assert section["shown"] == ["tumour"]
+    assert before > 0
+    assert surrogate == pytest.approx(0.1 * before, rel=1e-9)  # it was given 90 % of the truth
+    assert reference == pytest.approx(0.01 * before, rel=1e-9)
+    assert section["across"]["targets"]["tumour"] == pytest.approx(0.09 * before, rel=1e-9)
+    assert section["rows"][0]["distance"] > section["rows"][2]["distance"]
+
+
+def test_median_and_worst_sample_are_chosen(full: Workspace) -> None:
+    rows = report.surrogate_section(full, Studio("no pictures"))["rows"]
+    with np.load(full.folder / "validation.npz") as arrays:
+        errors = np.sort(arrays["errors_mean_m"])
+    assert [row["name"] for row in rows] == ["median", "worst"]
+    assert [row["error"] for row in rows] == pytest.approx(errors[1:].tolist())
+
+
+def test_file_needs_nothing_else(page: Page) -> None:
+    for tag, attributes in page.elements:
+        assert tag not in ("script", "link", "iframe", "object")
+        for name in ("src", "srcset", "href"):
+            address = attributes.get(name)
+            assert address is None or address.startswith(("data:image/png;base64,", "#"))
+
+
+def test_names_are_escaped(page: Page, full: Workspace) -> None:
+    assert "<i>liver & co" in page.text
+    assert "<b>vessel</b>" in page.text
+    raw = (full.folder / "report.html").read_text(encoding="utf-8")
+    assert "<i>liver" not in raw
+    assert "<b>vessel" not in raw
+
+
+def test_no_folder_of_the_machine_is_told(page: Page, full: Workspace) -> None:
+    assert "mean error 1 mm, from data.zarr" in page.text
+    assert 't.stl"' in page.text
+    for folder in (full.root, full.folder, Path.home(), Path(report.__file__).parent):
+        assert f"{folder}/" not in page.text
+        assert f"{folder.resolve()}/" not in page.text
+
+
+def test_empty_workspace_names_every_command(tmp_path: Path, no_rendering: None) -> None:
+    page = Page(report_stage(workspace(tmp_path)))
+    assert "Nothing has been made here yet." in page.text
+    for command in COMMANDS.values():
+        assert command in page.text
+    assert page.pictures() == []
+    assert "Research software: not a medical device" in page.text
+
+
+def test_each_section_names_its_command(tmp_path: Path) -> None:
+    space = workspace(tmp_path)
+    for name, command in COMMANDS.items():
+        section = report._guarded(report._SECTIONS[name], space, Studio("no pictures"))
+        if name in ("surrogate", "registration"):
+            assert set(section) == {"missing"}
+        assert command in section["missing"]
+
+
+def test_unfinished_data_set_says_how_far_it_is(tmp_path: Path, body: Body) -> None:
+    space = workspace(tmp_path)
+    make_data(space.data, body, blocks=3)
+    studio = Studio("no pictures")
+    assert "3 of 4 blocks" in report._guarded(report.data_section, space, studio)["missing"]
+    assert report.modes_section(space, studio)["count"] == 3
+
+
+def test_without_rendering_the_report_says_so(full: Workspace, no_rendering: None) -> None:
+    page = Page(report_stage(full))
+    assert len(page.pictures()) == 2  # the charts do not need it
+    assert "no picture: no driver here" in page.text
+    assert "7 equilibria accepted" in page.text
+
+
+@pytest.mark.parametrize(
+    ("file", "section"),
+    [
+        ("body.vtu", "organ"),
+        ("validation.npz", "surrogate"),
+        ("validation.json", "surrogate"),
+        ("demo/cloud.npy", "registration"),
+    ],
+)
+def test_damaged_file_spoils_its_section_only(
+    full: Workspace, tmp_path: Path, body: Body, file: str, section: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    space = workspace(tmp_path)
+    space.folder.mkdir()
+    write_body(space.body, body)
+    make_validation(space.folder, body)
+    make_demo(space.folder / "demo", body)
+    studio = Studio("no pictures")
+    assert "missing" not in report._guarded(report._SECTIONS[section], space, studio)
+    path = space.folder / file
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
+    found = report._guarded(report._SECTIONS[section], space, studio)
+    assert found["missing"]
+    assert str(tmp_path) not in found["missing"]
+
+
+def test_arrays_of_another_body_are_refused(tmp_path: Path, body: Body) -> None:
+    space = workspace(tmp_path)
+    space.folder.mkdir()
+    write_body(space.body, beam((3, 2, 2), (0.6, 0.2, 0.2), "tetrahedron"))
+    make_validation(space.folder, body)
+    message = report._guarded(report.surrogate_section, space, Studio("no pictures"))["missing"]
+    assert "displacements_true" in message
+    assert f"{len(body.points)}, 3" in message
+
+
+def test_view_holds_all_points_and_keeps_lengths(body: Body, rng: np.random.Generator) -> None:
+    towards = np.array([0.3, -1.0, 0.4])
+    view = view_of(towards, [body.points])
+    flat = (body.points - view.centre) @ np.column_stack([view.right, view.up])
+    assert (np.abs(flat) < view.half).all()
+    axes = np.stack([view.right, view.up, view.towards])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-14)  # a few roundings of unit vectors
+    assert np.linalg.det(axes) > 0  # not mirrored
+
+
+def test_camera_looks_at_the_observed_side(body: Body) -> None:
+    assert camera_side(body)[1] < 0  # the observed side is at y = 0, facing -y
+    assert np.isfinite(camera_side(beam((3, 2, 2), (0.6, 0.2, 0.2)))).all()
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(0.0, "0"), (0.0123456, "0.0123"), (17.25, "17.2"), (1430.2, "1,430"), (2e-7, "2.00e-07"), (float("nan"), "nan")],
+)
+def test_figures_are_readable(value: float, words: str) -> None:
+    assert figure(value) == words
+
+
+def test_tumours_stand_out() -> None:
+    colours = inner_colours(["vessel_a", "Tumor_1", "vessel_b", "tumour"])
+    assert colours["Tumor_1"] == colours["tumour"]
+    assert len({colours["vessel_a"], colours["vessel_b"], colours["tumour"]}) == 3
+
+
+def test_paths_are_cut_and_the_rest_is_kept(tmp_path: Path) -> None:
+    space = workspace(tmp_path)
+    told = (
+        f"block 3 in {space.folder.resolve()}/data.zarr, /opt/some/where.py; 3 N/m, mean / max, https://zenodo.org/a/b"
+    )
+    assert without_paths(told, space) == "block 3 in data.zarr, where.py; 3 N/m, mean / max, https://zenodo.org/a/b"
+
+
+def test_public_config_keeps_what_is_relative() -> None:
+    config = Config.model_validate(
+        {
+            "folder": "here",
+            "body": {"source": "/data/a/liver.stl", "zones": {"s": "/data/s.npy"}, "fixed": "in/veins.ply"},
+        }
+    )
+    public = public_config(config)
+    assert (public.folder, public.body.source, public.body.zones) == ("here", "liver.stl", {"s": "s.npy"})
+    assert public.body.fixed == "in/veins.ply"
+    assert public.loads == config.loads
+
+
+def test_template_stands_beside_the_module() -> None:
+    template = Path(report.__file__).with_name("report.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?://", template)

@@ -1,0 +1,268 @@
+"""The task farm: the same data for any number of ranks and after any kill; what is damaged is found and made again."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.shapes import beam
+from softtwin.reference import dataset
+from softtwin.reference.dataset import SPLITS, DataSet, DataSetError, drop_block
+from softtwin.reference.equilibrium import NewtonOptions, Problem
+from softtwin.reference.generate import Plan, generate, linear_response, probe_cotangent, solve_block
+from softtwin.reference.loads import LoadPlan
+
+PLAN = Plan(
+    loads=LoadPlan(modes=6, displacement=0.08),
+    samples={"train": 9, "validation": 3, "test": 4},
+    block=3,
+    seed=5,
+)
+PROGRAM = """
+import sys
+from softtwin.meshes.shapes import beam
+from softtwin.reference.generate import Plan, generate
+from softtwin.reference.loads import LoadPlan
+plan = Plan(loads=LoadPlan(modes=6, displacement=0.08), samples={"train": 9, "validation": 3, "test": 4}, block=3, seed=5)
+generate(sys.argv[1], beam((6, 2, 2), (0.6, 0.2, 0.2), "hexahedron"), plan)
+"""
+
+
+def body() -> Body:
+    return beam((6, 2, 2), (0.6, 0.2, 0.2), "hexahedron")
+
+
+def contents(data: DataSet) -> dict[str, np.ndarray]:
+    found = {}
+    for split in SPLITS:
+        samples = data.samples(split)
+        for name in ("draws", "forces", "displacements", "probes", "adjoints"):
+            found[f"{split}.{name}"] = getattr(samples, name)
+    return found
+
+
+def assert_same(first: DataSet, second: DataSet) -> None:
+    one, other = contents(first), contents(second)
+    for name, values in one.items():
+        assert values.size and np.array_equal(values, other[name]), name
+
+
+def start(path: Path, ranks: int) -> subprocess.Popen:
+    environment = {
+        **os.environ, "OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OPENBLAS_NUM_THREADS": "1",
+        "OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_hwloc_base_binding_policy": "none",
+    }
+    launch = [] if ranks == 1 else ["mpirun", "-n", str(ranks)]
+    return subprocess.Popen([*launch, sys.executable, "-c", PROGRAM, str(path)], env=environment, start_new_session=True)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> DataSet:
+    made = generate(tmp_path_factory.mktemp("data") / "data.zarr", body(), PLAN)
+    assert made is not None
+    return made
+
+
+def test_a_data_set_holds_what_was_asked(undisturbed: DataSet) -> None:
+    assert undisturbed.missing_blocks() == []
+    total = sum(len(undisturbed.samples(split)) for split in SPLITS)
+    assert total + len(undisturbed.rejected().draws) == sum(PLAN.samples.values())
+    assert undisturbed.header["plan"]["seed"] == 5 and "dolfinx" in undisturbed.header["versions"]
+    sizes = np.linalg.norm(undisturbed.samples("train").displacements, axis=2).max(axis=1)
+    assert 0.0 < sizes.min() and sizes.max() < 2 * 0.08
+
+
+def test_samples_are_equilibria_with_their_adjoints(undisturbed: DataSet) -> None:
+    samples = undisturbed.samples("test")
+    loaded = undisturbed.response.loaded
+    with Problem(undisturbed.body, PLAN.build_material()) as problem:
+        for load, u, probe, adjoint in zip(samples.forces, samples.displacements, samples.probes, samples.adjoints, strict=True):
+            forces = np.zeros_like(u)
+            forces[loaded] = load
+            balance = (problem.internal_forces(u) - forces)[problem.body.free]
+            assert np.linalg.norm(balance) <= 1.01e-8 * np.linalg.norm(load)
+            cotangent = probe_cotangent(problem.body, undisturbed.shapes, probe)
+            again = problem.apply_inverse(cotangent.ravel(), u).reshape(-1, 3)[loaded]
+            np.testing.assert_allclose(adjoint, again, rtol=1e-9, atol=1e-12)
+
+
+def test_splits_share_no_draw(undisturbed: DataSet) -> None:
+    draws = [set(undisturbed.split_draws(split)) for split in SPLITS]
+    assert not (draws[0] & draws[1] or draws[1] & draws[2] or draws[0] & draws[2])
+    blocks = [{draw // PLAN.block for draw in split} for split in draws]
+    assert not (blocks[0] & blocks[1] or blocks[1] & blocks[2] or blocks[0] & blocks[2])
+
+
+@pytest.mark.mpi
+@pytest.mark.skipif(shutil.which("mpirun") is None, reason="mpirun is absent")
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_ranks_do_not_change_the_data(undisturbed: DataSet, tmp_path: Path, ranks: int) -> None:
+    assert start(tmp_path / "data.zarr", ranks).wait(timeout=120) == 0
+    assert_same(undisturbed, DataSet(tmp_path / "data.zarr"))
+
+
+@pytest.mark.mpi
+@pytest.mark.skipif(shutil.which("mpirun") is None, reason="mpirun is absent")
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_kill_9_loses_only_what_was_under_way(undisturbed: DataSet, tmp_path: Path, ranks: int) -> None:
+    path = tmp_path / "data.zarr"
+    kills = 0
+    for delay in (0.0, 0.05, 0.1, 0.15):  # after the first block, so that a kill falls into different moments of the work
+        process = start(path, ranks)
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and process.poll() is None and not _blocks(path):
+            time.sleep(0.005)
+        time.sleep(delay)
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            kills += 1
+        process.wait()
+    assert kills > 0
+    again = generate(path, body(), PLAN)
+    assert again is not None and again.missing_blocks() == []
+    assert_same(undisturbed, again)
+
+
+def _blocks(path: Path) -> int:
+    return len(list((path / "samples" / "checksum" / "c").glob("*"))) if path.exists() else 0
+
+
+@pytest.mark.mpi
+def test_ctrl_c_leaves_whole_blocks(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    process = start(path, 1)
+    while process.poll() is None and not _blocks(path):
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    process.wait(timeout=30)
+    stopped = DataSet(path)
+    assert len(stopped.missing_blocks()) < stopped.block_count
+    again = generate(path, body(), PLAN)
+    assert again is not None
+    assert_same(undisturbed, again)
+
+
+def test_another_plan_or_body_is_refused_by_name(undisturbed: DataSet) -> None:
+    other = Plan(loads=PLAN.loads, samples=PLAN.samples, block=3, seed=6)
+    with pytest.raises(DataSetError, match=r"another plan \(differs in \['seed'\]\)"):
+        generate(undisturbed.path, body(), other)
+    with pytest.raises(DataSetError, match="data set of another body"):
+        generate(undisturbed.path, beam((5, 2, 2), (0.6, 0.2, 0.2)), PLAN)
+
+
+def test_a_truncated_block_is_found_and_made_again(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    chunk = path / "samples" / "displacements" / "c" / "1" / "0" / "0"
+    chunk.write_bytes(chunk.read_bytes()[: chunk.stat().st_size // 2])
+    with pytest.raises(DataSetError, match=r"block 1 .*(damaged|checksum)"):
+        DataSet(path).samples("train")
+    drop_block(path, 1)
+    with pytest.raises(DataSetError, match=r"block 1 of \d+ .* never finished.*softtwin generate"):
+        DataSet(path).samples("train")
+    generate(path, body(), PLAN)
+    assert_same(undisturbed, DataSet(path))
+
+
+def test_a_changed_number_does_not_pass_the_checksum(undisturbed: DataSet, tmp_path: Path) -> None:
+    import zarr
+
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    forces = zarr.open_group(str(path), mode="r+")["samples/forces"]
+    forces[4, 0, 0] = float(forces[4, 0, 0]) + 1e-9
+    with pytest.raises(DataSetError, match=r"block 1 .* does not match its checksum"):
+        DataSet(path).samples("train")
+
+
+def test_a_header_that_was_never_written_is_no_data_set(tmp_path: Path) -> None:
+    with pytest.raises(DataSetError, match=r"expected a Zarr 3 data set .*`softtwin generate`"):
+        DataSet(tmp_path / "nothing.zarr")
+
+
+def test_a_full_disk_keeps_what_was_whole(undisturbed: DataSet, tmp_path: Path, monkeypatch) -> None:
+    """Writes fail with the error of a full disk from the second block on; with room again the run ends the same."""
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    for block in range(1, undisturbed.block_count):
+        drop_block(path, block)
+    from softtwin.reference import generate as farm
+
+    written = []
+
+    def full(target: Path, block: int, arrays: dict) -> None:
+        if written:
+            raise OSError(28, "No space left on device")
+        written.append(block)
+        dataset.write_block(target, block, arrays)
+
+    monkeypatch.setattr(farm, "write_block", full)
+    with pytest.raises(OSError, match="No space left"):
+        generate(path, body(), PLAN)
+    assert DataSet(path).missing_blocks() == list(range(2, undisturbed.block_count))
+    monkeypatch.undo()
+    generate(path, body(), PLAN)
+    assert_same(undisturbed, DataSet(path))
+
+
+def test_rejected_draws_are_kept_apart_with_their_reason(tmp_path: Path) -> None:
+    """A solver that is given no time rejects what needs it; the rest is accepted, and both are told apart."""
+    hasty = Plan(
+        loads=LoadPlan(modes=6, amplitude=0.5), samples={"train": 12, "validation": 1, "test": 1}, block=3,
+        newton=NewtonOptions(max_iterations=6, max_load_steps=1),
+    )
+    data = generate(tmp_path / "data.zarr", body(), hasty)
+    assert data is not None
+    rejected, kept = data.rejected(), data.samples("train")
+    assert len(rejected.draws) > 0 and len(kept) > 0
+    assert set(rejected.reasons) <= {"not converged", "unstable equilibrium"}
+    assert not set(rejected.draws) & set(kept.draws)
+    assert np.abs(rejected.forces).max() > 0.0  # what was asked of the solver is not lost
+
+
+def test_the_linear_response_of_low_rank_is_close_to_the_whole(monkeypatch) -> None:
+    from softtwin.reference import generate as farm
+
+    with Problem(body(), PLAN.build_material()) as problem:
+        loaded = np.setdiff1d(problem.body.boundary_nodes, problem.body.fixed)
+        whole = linear_response(problem, loaded)
+        monkeypatch.setattr(farm, "_EXACT_COLUMNS", 0)
+        monkeypatch.setattr(farm, "_RANK", 60)
+        low = linear_response(problem, loaded)
+    forces = np.random.default_rng(0).standard_normal((3, len(loaded), 3))
+    assert low.left.shape[1] == 60 and low.right.shape == (60, 3 * len(loaded))
+    exact, close = whole.apply(forces), low.apply(forces)
+    assert np.linalg.norm(close - exact) < 0.03 * np.linalg.norm(exact)
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"material": "rubber"}, r"Plan\.material: expected one of .* got 'rubber'"),
+        ({"young_modulus": -1.0}, r"young_modulus: expected a positive"),
+        ({"poisson_ratio": 0.5}, r"poisson_ratio: expected a number in \(0, 0.5\)"),
+        ({"samples": {"train": 3}}, r"Plan\.samples: expected at least one draw"),
+        ({"block": 0}, r"Plan\.block: expected at least 1"),
+    ],
+)
+def test_plans_that_cannot_be_are_refused(entries: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Plan(**entries)
+
+
+def test_solving_a_block_again_changes_nothing(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    solve_block(str(path), 2)
+    assert_same(undisturbed, DataSet(path))
