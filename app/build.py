@@ -150,8 +150,8 @@ def _attached(bare: Body, nodes: Ints) -> Ints:
     whole = bare.boundary[np.isin(bare.boundary, nodes).all(axis=1)]
     if len(whole) == 0:
         raise BodyError(
-            f"body.fixed: expected fixed nodes that cover part of the surface, got {len(nodes)} nodes that span no whole "
-            "boundary triangle; enlarge fixed_distance or give more of the attachment."
+            f"body.fixed: expected fixed nodes that cover part of the surface, got {len(nodes)} nodes that span no "
+            "whole boundary triangle; enlarge fixed_distance or give more of the attachment."
         )
     return np.unique(whole)
 
@@ -162,7 +162,8 @@ def _nodes_from(body: Body, name: str, path: Path, section: BodySection) -> Ints
     if numbers is not None:
         if numbers.size and (numbers.min() < 0 or numbers.max() >= len(body.points)):
             raise BodyError(
-                f"{name}: expected node numbers in 0..{len(body.points) - 1}, got {numbers.min()}..{numbers.max()} in {path}."
+                f"{name}: expected node numbers in 0..{len(body.points) - 1}, "
+                f"got {numbers.min()}..{numbers.max()} in {path}."
             )
         return np.unique(numbers)
     near = section.fixed_distance or float(np.median(edge_lengths(body.points, body.cells)))
@@ -171,7 +172,7 @@ def _nodes_from(body: Body, name: str, path: Path, section: BodySection) -> Ints
     if len(nodes) == 0:
         raise BodyError(
             f"{name}: no boundary node lies within {1e3 * near:.1f} mm of the points in {path} "
-            f"(the nearest is {1e3 * distances.min():.1f} mm away). Same unit and coordinates? Else raise fixed_distance."
+            f"(the nearest is {1e3 * distances.min():.1f} mm away). Same unit and axes? Else raise fixed_distance."
         )
     return nodes
 
@@ -181,7 +182,9 @@ def _read_numbers(path: Path) -> Ints | None:
     if not path.is_file():
         raise FileError(f"{path}: expected a file, found none.")
     try:
-        values = np.load(path) if path.suffix == ".npy" else np.loadtxt(path, ndmin=1) if path.suffix == ".txt" else None
+        values = (
+            np.load(path) if path.suffix == ".npy" else np.loadtxt(path, ndmin=1) if path.suffix == ".txt" else None
+        )
     except ValueError:
         return None
     if values is None or values.ndim != 1 or not np.array_equal(values, np.round(values)):
@@ -190,7 +193,9 @@ def _read_numbers(path: Path) -> Ints | None:
 
 
 def _with_zones(body: Body, section: BodySection, root: Path) -> Body:
-    zones = {name: _nodes_from(body, f"body.zones.{name}", root / file, section) for name, file in section.zones.items()}
+    zones = {
+        name: _nodes_from(body, f"body.zones.{name}", root / file, section) for name, file in section.zones.items()
+    }
     body = body.with_sets(**zones)
     inner = {name: read_surface(root / file, section.unit) for name, file in section.inner.items()}
     body = body.with_inner(**inner)

@@ -1,4 +1,4 @@
-"""The whole chain for one organ: from its surface to a finished, validated twin; what is there already is not made again."""
+"""The whole chain for one organ, from its surface to a validated twin; what is there already is not made again."""
 
 from __future__ import annotations
 
@@ -64,12 +64,20 @@ def make_twin(space: Workspace, path: Path, say: Callable[[str], None]) -> None:
     say("2/4 generate: eigenmodes, modal loads, equilibria")
     if not _complete(space):
         generate_in_parallel(path, space.config.samples.ranks)
-    rejected = DataSet(space.data).rejected()
-    say(f"    {sum(DataSet(space.data).header['samples'].values()) - len(rejected.draws)} equilibria, {len(rejected.draws)} rejected")
+    say(f"    {describe_data(DataSet(space.data))}")
     say("3/4 train: the surrogate")
     train_stage(space)
     say("4/4 validate: held-out errors")
     say(validate_stage(space))
+
+
+def describe_data(data: DataSet) -> str:
+    """Counts of accepted and rejected draws, with the reasons of the rejected."""
+    rejected = data.rejected()
+    counts = {reason: rejected.reasons.count(reason) for reason in sorted(set(rejected.reasons))}
+    total = sum(data.header["samples"].values())
+    because = f" ({', '.join(f'{count} {reason}' for reason, count in counts.items())})" if counts else ""
+    return f"{total - len(rejected.draws)} equilibria accepted, {len(rejected.draws)} rejected{because}"
 
 
 def _complete(space: Workspace) -> bool:

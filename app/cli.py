@@ -66,21 +66,13 @@ def mesh(configuration: Path) -> None:
 def generate(configuration: Path, redo: tuple[int, ...]) -> None:
     """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped."""
     from .build import generate_stage, open_workspace
+    from .chain import describe_data
 
     space = open_workspace(configuration)
     data = generate_stage(space, redo)
     if data is not None:
         click.echo(describe_data(data))
         click.echo(f"written to {space.data}")
-
-
-def describe_data(data: Any) -> str:
-    """Counts of accepted and rejected draws, with the reasons of the rejected."""
-    rejected = data.rejected()
-    counts = {reason: rejected.reasons.count(reason) for reason in sorted(set(rejected.reasons))}
-    total = sum(data.header["samples"].values())
-    because = f" ({', '.join(f'{count} {reason}' for reason, count in counts.items())})" if counts else ""
-    return f"{total - len(rejected.draws)} equilibria accepted, {len(rejected.draws)} rejected{because}"
 
 
 @softtwin.command()
@@ -111,14 +103,20 @@ def validate(configuration: Path) -> None:
 @softtwin.command()
 @click.argument("twin", type=_EXISTING)
 @click.argument("clouds", nargs=-1, required=True, type=_PATH)
-@click.option("--model", type=click.Choice(["surrogate", "reference"]), help="Forward model; the twin's choice if not given.")
-@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the clouds.")
+@click.option(
+    "--model", type=click.Choice(["surrogate", "reference"]), help="Forward model; the twin's choice if not given."
+)
+@click.option(
+    "--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the clouds."
+)
 @click.option("--zone", help="Node set whose nodes may carry force.")
 @click.option("--noise", type=float, help="Expected noise of the clouds, metres.")
 @click.option("--smoothness", type=float, help="Correlation length of neighbouring forces, metres.")
 @click.option("--truth", type=_EXISTING, help="True node positions (frames, n, 3) in .npy, metres, to state errors.")
 @click.option("--output", type=_PATH, default=Path("registration"), show_default=True, help="Folder of the results.")
-def register(twin: Path, clouds: tuple[Path, ...], model: str | None, unit: str, truth: Path | None, output: Path, **chosen: Any) -> None:
+def register(
+    twin: Path, clouds: tuple[Path, ...], model: str | None, unit: str, truth: Path | None, output: Path, **chosen: Any
+) -> None:
     """Register CLOUDS (one file a frame, in order) to TWIN; writes a VTU a frame and registration.json."""
     from .register import forward_model, make_registrar, open_twin, read_clouds, register_clouds
 
@@ -152,23 +150,35 @@ def report(configuration: Path) -> None:
 
 @softtwin.command()
 @click.argument("surface_or_mesh", type=_PATH)
-@click.option("--fixed", type=_PATH, help="What holds the organ: points or triangles near it, or node numbers (.npy, .txt).")
-@click.option("--fixed-distance", type=float, default=0.0, help="How near to --fixed a node is fixed, metres; 0: one cell.")
+@click.option(
+    "--fixed", type=_PATH, help="What holds the organ: points or triangles near it, or node numbers (.npy, .txt)."
+)
+@click.option(
+    "--fixed-distance", type=float, default=0.0, help="How near to --fixed a node is fixed, metres; 0: one cell."
+)
 @click.option("--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the files.")
-@click.option("--observed", type=_PATH, help="The side a camera sees: a surface file, or triangles of node numbers (.npy).")
+@click.option(
+    "--observed", type=_PATH, help="The side a camera sees: a surface file, or triangles of node numbers (.npy)."
+)
 @click.option("--zone", "zones", multiple=True, metavar="NAME=FILE", help="Where tools may touch (may be repeated).")
 @click.option("--inner", multiple=True, metavar="NAME=FILE", help="A vessel or tumour surface to carry along.")
 @click.option("--nodes", type=int, default=2000, show_default=True, help="Nodes wanted where a surface is made solid.")
 @click.option("--cell-size", type=float, default=0.0, help="Edge length instead, metres.")
 @click.option("--repair", is_flag=True, help="Mend an open or self-intersecting surface first.")
-@click.option("--law", type=click.Choice(["neo-hookean", "saint-venant-kirchhoff"]), default="neo-hookean", show_default=True)
+@click.option(
+    "--law", type=click.Choice(["neo-hookean", "saint-venant-kirchhoff"]), default="neo-hookean", show_default=True
+)
 @click.option("--young-modulus", type=float, default=5000.0, show_default=True, help="Pascals.")
 @click.option("--poisson-ratio", type=float, default=0.45, show_default=True)
-@click.option("--displacement", type=float, default=0.05, show_default=True, help="Largest displacement to learn, metres.")
+@click.option(
+    "--displacement", type=float, default=0.05, show_default=True, help="Largest displacement to learn, metres."
+)
 @click.option("--samples", type=int, default=512, show_default=True, help="Equilibria to learn from.")
 @click.option("--seconds", type=float, default=120.0, show_default=True, help="Time to train.")
 @click.option("--ranks", type=int, default=0, help="MPI ranks; 0: one a core.")
-@click.option("--output", type=_PATH, default=Path("twin-run"), show_default=True, help="Folder of everything that is made.")
+@click.option(
+    "--output", type=_PATH, default=Path("twin-run"), show_default=True, help="Folder of everything that is made."
+)
 def build(surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, **given: Any) -> None:
     """Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH): mesh, equilibria, surrogate, held-out errors.
 
@@ -189,7 +199,12 @@ def build(surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...],
         "body": body,
         "material": {name: given[name] for name in ("law", "young_modulus", "poisson_ratio")},
         "loads": {"displacement": given["displacement"], "zones": sorted(body["zones"])},
-        "samples": {"train": given["samples"], "validation": max(8, given["samples"] // 8), "test": max(8, given["samples"] // 4), "ranks": given["ranks"]},
+        "samples": {
+            "train": given["samples"],
+            "validation": max(8, given["samples"] // 8),
+            "test": max(8, given["samples"] // 4),
+            "ranks": given["ranks"],
+        },
         "training": {"seconds": given["seconds"]},
     }
     build_twin(parse_config(entries, "command line"), output, click.echo)
@@ -206,8 +221,16 @@ def _named_files(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:
 
 
 @softtwin.command()
-@click.option("--output", type=_PATH, default=Path("softtwin-quickstart"), show_default=True, help="Folder of everything that is made.")
-@click.option("--small", is_flag=True, help="A coarse organ and few samples: the same path in about a minute, for tests.")
+@click.option(
+    "--output",
+    type=_PATH,
+    default=Path("softtwin-quickstart"),
+    show_default=True,
+    help="Folder of everything that is made.",
+)
+@click.option(
+    "--small", is_flag=True, help="A coarse organ and few samples: the same path in about a minute, for tests."
+)
 def quickstart(output: Path, small: bool) -> None:
     """Run the whole chain on a liver phantom: mesh, modes, equilibria, surrogate, registration, report (minutes)."""
     from .quickstart import run_quickstart
@@ -232,7 +255,10 @@ def main(arguments: list[str] | None = None) -> None:
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        click.echo("error: the disk is full. What was written whole is kept; make room and run the same command again.", err=True)
+        click.echo(
+            "error: the disk is full. What was written whole is kept; make room and run the same command again.",
+            err=True,
+        )
         sys.exit(2)
     except (ValueError, RuntimeError) as error:
         if not _is_ours(error):

@@ -24,16 +24,29 @@ class _Section(BaseModel):
 class BodySection(_Section):
     """Where the body comes from."""
 
-    source: str = Field("liver-phantom", description="a surface or mesh file (STL PLY OBJ VTK VTU VTP MSH), or a shape: liver-phantom, propeller, beam")
+    source: str = Field(
+        "liver-phantom",
+        description="a surface or mesh file (STL PLY OBJ VTK VTU VTP MSH), or a shape: liver-phantom, propeller, beam",
+    )
     unit: Literal["m", "cm", "mm"] = Field("m", description="unit of length in the files")
     cell_size: float = Field(0.0, ge=0.0, description="edge length of the tetrahedra in metres; 0: from nodes")
     nodes: Count = Field(2000, description="number of nodes wanted where a surface is made solid and cell_size is 0")
     repair: bool = Field(False, description="mend an open or self-intersecting surface first")
-    fixed: str = Field("", description="what holds the organ: a file of points or triangles near which boundary nodes are fixed, or .npy/.txt of node numbers")
+    fixed: str = Field(
+        "",
+        description="what holds the organ: points or triangles near it, or .npy/.txt of node numbers",
+    )
     fixed_distance: float = Field(0.0, ge=0.0, description="how near, in metres; 0: one cell")
-    observed: str = Field("", description="the side that a camera sees: a surface file or (t, 3) node numbers in .npy; empty: the whole boundary")
-    zones: dict[str, str] = Field(default_factory=dict, description="named zones that tools may touch: files as for fixed")
-    inner: dict[str, str] = Field(default_factory=dict, description="named inner surfaces (vessels, tumours): surface files in the same unit")
+    observed: str = Field(
+        "",
+        description="what a camera sees: a surface file or (t, 3) node numbers in .npy; empty: the whole boundary",
+    )
+    zones: dict[str, str] = Field(
+        default_factory=dict, description="named zones that tools may touch: files as for fixed"
+    )
+    inner: dict[str, str] = Field(
+        default_factory=dict, description="named inner surfaces (vessels, tumours): surface files in the same unit"
+    )
 
 
 class MaterialSection(_Section):
@@ -47,13 +60,19 @@ class MaterialSection(_Section):
 class LoadsSection(_Section):
     """The loads that the twin learns from (modes of the stiffness at rest, masked to patches)."""
 
-    kind: Literal["modal", "random"] = Field("modal", description="modal loads, or independent nodal forces to compare with")
+    kind: Literal["modal", "random"] = Field(
+        "modal", description="modal loads, or independent nodal forces to compare with"
+    )
     modes: Count = Field(10, description="eigenmodes that make the loads")
     patches: Count = Field(2, description="most patches that act at once")
-    radius: tuple[Positive, Positive] = Field((0.06, 0.65), description="smallest and largest patch, relative to its zone")
+    radius: tuple[Positive, Positive] = Field(
+        (0.06, 0.65), description="smallest and largest patch, relative to its zone"
+    )
     zones: tuple[str, ...] = Field((), description="names of zones that carry the loads; empty: the whole boundary")
     displacement: Positive = Field(0.05, description="largest displacement wanted, metres; the loads are scaled to it")
-    amplitude: float = Field(0.0, ge=0.0, description="fixed amplitude in newtons instead; 0: scale to the displacement")
+    amplitude: float = Field(
+        0.0, ge=0.0, description="fixed amplitude in newtons instead; 0: scale to the displacement"
+    )
 
 
 class SamplesSection(_Section):
@@ -63,7 +82,9 @@ class SamplesSection(_Section):
     validation: Count = Field(64, description="draws to choose the best weights with")
     test: Count = Field(128, description="draws held out, never seen in training")
     block: Count = Field(8, description="draws in one block of work")
-    path: Count = Field(1, description="draws that share a load at growing sizes, each solved from the one before; divides block")
+    path: Count = Field(
+        1, description="draws that share a load at growing sizes, each solved from the one before; divides block"
+    )
     seed: int = Field(0, ge=0, description="seed of everything random")
     ranks: int = Field(0, ge=0, description="MPI ranks that build and quickstart start; 0: one a core")
 
@@ -71,7 +92,9 @@ class SamplesSection(_Section):
 class TrainingSection(_Section):
     """The surrogate."""
 
-    architecture: Literal["reduced", "mlp"] = Field("reduced", description="reduced network, or the thesis's perceptron as yardstick")
+    architecture: Literal["reduced", "mlp"] = Field(
+        "reduced", description="reduced network, or the thesis's perceptron as yardstick"
+    )
     modes: Count = Field(64, description="displacement modes (POD) of the reduced network")
     width: Count = Field(256, description="width of its blocks")
     seconds: Positive = Field(120.0, description="time to train")

@@ -32,10 +32,14 @@ def quickstart_config(small: bool) -> Config:
     if small:
         samples = {"train": 24, "validation": 8, "test": 8, "block": 4}
         body = {"source": "liver-phantom", "cell_size": 0.016}
-        return Config.model_validate({"folder": ".", "body": body, "loads": loads, "samples": samples, "training": {"seconds": 5.0, "modes": 16}})
+        return Config.model_validate(
+            {"folder": ".", "body": body, "loads": loads, "samples": samples, "training": {"seconds": 5.0, "modes": 16}}
+        )
     samples = {"train": 256, "validation": 32, "test": 48}
     body = {"source": "liver-phantom", "cell_size": 0.0105}
-    return Config.model_validate({"folder": ".", "body": body, "loads": loads, "samples": samples, "training": {"seconds": 60.0}})
+    return Config.model_validate(
+        {"folder": ".", "body": body, "loads": loads, "samples": samples, "training": {"seconds": 60.0}}
+    )
 
 
 def run_quickstart(output: Path, small: bool, say: Callable[[str], None]) -> Path:
@@ -109,13 +113,22 @@ def _target_errors(body: Body, displacement: Floats, truth: Floats) -> dict[str,
 
 
 def _register(
-    space: Workspace, name: str, body: Body, section: RegistrationSection, cloud: Floats, truth: Floats, forces: Floats, say: Callable[[str], None]
+    space: Workspace,
+    name: str,
+    body: Body,
+    section: RegistrationSection,
+    cloud: Floats,
+    truth: Floats,
+    forces: Floats,
+    say: Callable[[str], None],
 ) -> None:
     folder = space.folder / "demo"
     with forward_model(name, space.twin, body, space.config) as model:
         registrar = make_registrar(model, space.config, section)
         result = register_clouds(registrar, [cloud], folder / name, truth[None] + body.points, lambda line: None)[0]
     np.savez(folder / f"{name}.npz", displacement=result.displacement, forces=result.forces, true_forces=forces)
-    errors = ", ".join(f"{key} {1e3 * value:.2f} mm" for key, value in _target_errors(body, result.displacement, truth).items())
+    errors = ", ".join(
+        f"{key} {1e3 * value:.2f} mm" for key, value in _target_errors(body, result.displacement, truth).items()
+    )
     net, true = np.linalg.norm(result.net_force), np.linalg.norm(forces.sum(axis=0))
     say(f"    after, with the {name}: {errors}; net force {net:.2f} N, true {true:.2f} N; {result.seconds:.2f} s")

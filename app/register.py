@@ -130,7 +130,7 @@ def register_clouds(
 def frame_figures(
     body: Body, result: Registration, frame: int, targets: dict[str, Any], truth: Floats | None
 ) -> dict[str, Any]:
-    """What is known of a registered frame: movement of the inner surfaces, net force and its doubt; errors with truth."""
+    """What is known of a registered frame: movement of the inner surfaces, net force, doubt; errors with truth."""
     row: dict[str, Any] = {
         "frame": frame,
         "rms_distance_m": result.rms_distance,
@@ -140,7 +140,9 @@ def frame_figures(
         "seconds": result.seconds,
         "iterations": len(result.trace),
         "reason": result.reason,
-        "targets": {name: {"movement_m": _mean_length(points.displace(result.displacement))} for name, points in targets.items()},
+        "targets": {
+            name: {"movement_m": _mean_length(points.displace(result.displacement))} for name, points in targets.items()
+        },
     }
     if truth is not None:
         row["error"] = asdict(target_errors(body.points + result.displacement, body.points + truth))
@@ -158,8 +160,8 @@ def describe(row: dict[str, Any]) -> str:
     """One line for a person: distance, net force with its doubt, time, and errors where the truth is known."""
     force, doubt = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
     line = (
-        f"frame {row['frame']:3d}: cloud to surface {1e3 * row['rms_distance_m']:.2f} mm, net force {force:.3f} ± {doubt:.3f} N, "
-        f"{1e3 * row['seconds']:.0f} ms"
+        f"frame {row['frame']:3d}: cloud to surface {1e3 * row['rms_distance_m']:.2f} mm, "
+        f"net force {force:.3f} ± {doubt:.3f} N, {1e3 * row['seconds']:.0f} ms"
     )
     if "error" in row:
         line += f", error {1e3 * row['error']['mean']:.2f} mm"

@@ -1,6 +1,6 @@
-"""One equilibrium of the thesis's beam: 304 hexahedra, tip deflection 0.3 m, and 100 modal loads of the data set's kind.
+"""One equilibrium of the thesis's beam: 304 hexahedra, tip deflection 0.3 m; and 100 modal loads.
 
-    python benchmarks/beam_solve.py
+python benchmarks/beam_solve.py
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Reduced network against the thesis's perceptron on the same data: 304-hexahedra beam, 2,048 modal samples, held-out test.
+"""Reduced network against the thesis's perceptron on the same data: the beam, 2,048 modal samples, held-out test.
 
     python benchmarks/beam_surrogate.py [--data FOLDER] [--ranks 2] [--reduced-seconds 200] [--mlp-seconds 200]
 
@@ -56,7 +56,9 @@ def main() -> None:
     plan = plan_from_header(data.header)
     with Problem(data.body, plan.build_material(), plan.newton) as problem:
         test = data.samples("test")
-        few = Samples(*(getattr(test, name)[:100] for name in ("draws", "forces", "displacements", "probes", "adjoints")))
+        few = Samples(
+            *(getattr(test, name)[:100] for name in ("draws", "forces", "displacements", "probes", "adjoints"))
+        )
         adjoint = adjoint_of(ReferenceModel(problem))
         for name, training in plans.items():
             begin = time.perf_counter()
@@ -66,13 +68,19 @@ def main() -> None:
             cosines = registration_cosines(surrogate, data, few, adjoint)
             figures[name] = {
                 **evaluations[name].as_dict(),
-                "registration_cosine": {"mean": cosines.mean(), "median": np.median(cosines), "p5": np.quantile(cosines, 0.05)},
+                "registration_cosine": {
+                    "mean": cosines.mean(),
+                    "median": np.median(cosines),
+                    "p5": np.quantile(cosines, 0.05),
+                },
                 "training_seconds": seconds,
                 "weights": sum(array.size for array in surrogate.core.arrays().values()),
             }
     print(table(evaluations))
     for name in plans:
-        print(name, "weights", figures[name]["weights"], "registration-like cosine", figures[name]["registration_cosine"])
+        print(
+            name, "weights", figures[name]["weights"], "registration-like cosine", figures[name]["registration_cosine"]
+        )
     write("beam_surrogate", figures)
 
 

@@ -19,7 +19,9 @@ LIVER = Path(__file__).parents[2] / "shared" / "data" / "liver"
 def machine() -> dict[str, Any]:
     """Processor, cores and load of this machine, and the versions that figures depend on."""
     info = Path("/proc/cpuinfo")
-    model = next((line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")), "")
+    model = next(
+        (line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")), ""
+    )
     names = ("numpy", "scipy", "torch", "vtk", "zarr", "fenics-dolfinx", "petsc4py", "slepc4py")
     return {
         "processor": model,

@@ -57,7 +57,9 @@ def run(data: Sequence, model: ForwardModel, frames: int, noise: float, smoothne
     """Errors, forces and times of every frame."""
     body = model.body
     control = nodal_control(body, data.zone, force_scale=0.1, smoothness=smoothness)
-    registrar = Registrar(model, CloudObjective(body, body.surfaces["observed"]), control, RegistrationOptions(noise=noise))
+    registrar = Registrar(
+        model, CloudObjective(body, body.surfaces["observed"]), control, RegistrationOptions(noise=noise)
+    )
     rows = []
     for i, result in enumerate(register_sequence(registrar, data.clouds[:frames])):
         errors = 1e3 * np.linalg.norm(result.displacement - (data.positions[i] - body.points), axis=1)

@@ -1,4 +1,4 @@
-"""The reference as a forward model for registration: equilibria, adjoint gradients and sensitivities at the last state."""
+"""The reference as a forward model for registration: equilibria, adjoints and sensitivities at the last state."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class ReferenceModel:
         return result.displacement
 
     def pullback(self, cotangent: ArrayLike) -> Floats:
-        """Gradient with respect to the forces, (n, 3), of a function whose gradient with respect to the displacement is given.
+        """Gradient with respect to the forces, (n, 3), from the one with respect to the displacement.
 
         It is the adjoint K(u)^-1 g at the last state (Odot 2023, eq. 6.8-6.10), zero at fixed nodes.
 

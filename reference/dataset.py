@@ -1,4 +1,4 @@
-"""Data sets of equilibria: Zarr 3 on disk, one chunk a block of samples, written whole or not at all (no FEniCSx here)."""
+"""Data sets of equilibria: Zarr 3 on disk, one chunk a block of samples, whole or not at all (no FEniCSx here)."""
 
 from __future__ import annotations
 
@@ -94,7 +94,9 @@ class DataSet:
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         if not (self.path / "zarr.json").exists():
-            raise DataSetError(f"DataSet: expected a Zarr 3 data set in {self.path}, found none; make one with `softtwin generate`.")
+            raise DataSetError(
+                f"DataSet: expected a Zarr 3 data set in {self.path}, found none; make one with `softtwin generate`."
+            )
         try:
             self._root = zarr.open_group(str(self.path), mode="r")
             self.header: dict[str, Any] = json.loads(str(self._root.attrs["header"]))
@@ -119,7 +121,9 @@ class DataSet:
             },
         )
         if body.fingerprint != names["fingerprint"]:
-            raise DataSetError(f"DataSet: the body in {self.path} differs from the one it was made with; is it damaged?")
+            raise DataSetError(
+                f"DataSet: the body in {self.path} differs from the one it was made with; is it damaged?"
+            )
         return body
 
     @cached_property

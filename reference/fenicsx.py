@@ -1,10 +1,11 @@
-"""Every difference between DOLFINx versions, and nothing else: 0.5.2 (Debian 12) to 0.11 (wheel) behind one set of names.
+"""Every difference between DOLFINx versions, and nothing else: 0.5.2 (Debian 12) to 0.11 (wheel) behind the same names.
 
 It asks for signatures and attributes, never for version numbers.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import inspect
@@ -14,14 +15,11 @@ import platform
 import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-try:
+with contextlib.suppress(ImportError):
     import dolfinx_solver  # noqa: F401  the PyPI wheel wants to be imported before dolfinx
-except ImportError:
-    pass
 import petsc4py
 
 # PETSc's own handler turns SIGTERM and SIGPIPE into MPI_Abort; Python's must stay.
@@ -62,7 +60,7 @@ _COMPILE = ["-O3", "-march=native", "-ffast-math"]
 _COMPILE_TIMEOUT_S = 180
 
 
-@contextmanager
+@contextlib.contextmanager
 def quiet_jit() -> Iterator[None]:
     """Keep the root logger silent and as it was: setuptools sets it to INFO while 0.5.2 compiles a form."""
     root = logging.getLogger()
@@ -88,7 +86,7 @@ def _cache_directory() -> Path:
     return base / "softtwin" / f"forms-{dolfinx.__version__}-{hashlib.sha256(cpu.encode()).hexdigest()[:12]}"
 
 
-@contextmanager
+@contextlib.contextmanager
 def _compiling(cache: Path) -> Iterator[None]:
     """One compiling process at a time; what an earlier one left half-made when it was killed is removed.
 

@@ -71,7 +71,9 @@ class Plan:
         if self.material not in MATERIALS:
             raise ValueError(f"Plan.material: expected one of {sorted(MATERIALS)}, got {self.material!r}.")
         if set(self.samples) != set(SPLITS) or min(self.samples.values()) < 1:
-            raise ValueError(f"Plan.samples: expected at least one draw for each of {SPLITS}, got {dict(self.samples)}.")
+            raise ValueError(
+                f"Plan.samples: expected at least one draw for each of {SPLITS}, got {dict(self.samples)}."
+            )
         if self.block < 1:
             raise ValueError(f"Plan.block: expected at least 1, got {self.block}.")
         if self.path < 1 or self.block % self.path:
@@ -226,7 +228,7 @@ def _calibrate(problem: Problem, response: LinearResponse, shapes: Floats, plan:
 
 
 def _reach(problem: Problem, unit: Floats, plan: Plan) -> float:
-    """Multiple of a load of unit linear displacement that moves the body by the wanted displacement, or as far as it goes."""
+    """Multiple of a load of unit linear displacement that moves the body as far as wanted, or as far as it goes."""
     wanted = plan.loads.displacement
     before, scale, guess = 0.0, 0.0, np.zeros_like(unit)
     while scale < 4.0 * wanted:
@@ -259,7 +261,7 @@ def _solve_here(path: Path, blocks: list[int]) -> None:
         solve_block(str(path), block)
 
 
-def _farm(pool: MPICommExecutor, path: Path, blocks: list[int], workers: int) -> None:
+def _farm(pool: Any, path: Path, blocks: list[int], workers: int) -> None:
     """Keep two blocks with every worker, and solve one here whenever they are all busy."""
     waiting = iter(blocks)
     busy: set[Future[int]] = set()
@@ -338,7 +340,7 @@ def probe_cotangent(body: Body, shapes: Floats, probe: Floats) -> Floats:
     return cotangent
 
 
-def _solve_path(data: DataSet, plan: Plan, problem: Problem, path: int) -> Iterator[dict[str, NDArray[Any]]]:
+def _solve_path(data: DataSet, plan: Plan, problem: Problem, path: int) -> Iterator[dict[str, Any]]:
     load, factors = path_loads(data, plan, path)
     loaded = data.response.loaded
     state: Equilibrium | None = None
@@ -357,7 +359,7 @@ def _solve_path(data: DataSet, plan: Plan, problem: Problem, path: int) -> Itera
         yield row | _solved_row(state, adjoint, plan)
 
 
-def _empty_row(forces: Floats, probe: Floats, data: DataSet) -> dict[str, NDArray[Any]]:
+def _empty_row(forces: Floats, probe: Floats, data: DataSet) -> dict[str, Any]:
     return {
         "forces": forces,
         "displacements": np.zeros_like(data.body.points),
@@ -372,7 +374,7 @@ def _empty_row(forces: Floats, probe: Floats, data: DataSet) -> dict[str, NDArra
     }
 
 
-def _solved_row(state: Equilibrium, adjoint: Floats, plan: Plan) -> dict[str, NDArray[Any]]:
+def _solved_row(state: Equilibrium, adjoint: Floats, plan: Plan) -> dict[str, Any]:
     pivots = state.negative_pivots or 0
     return {
         "displacements": state.displacement,

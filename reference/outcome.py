@@ -40,5 +40,5 @@ class Equilibrium:
         return self.negative_pivots == 0
 
 
-class NotConverged(RuntimeError):
+class NotConverged(RuntimeError):  # noqa: N818 - the way a search ended, named as one says it
     """No equilibrium was found; the message says how far the load was taken and what to try."""

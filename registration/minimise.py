@@ -40,14 +40,16 @@ class RegistrationOptions:
     def __post_init__(self) -> None:
         for name in ("noise", "step", "max_step"):
             if not getattr(self, name) > 0.0:
-                raise ValueError(f"RegistrationOptions.{name}: expected a positive length in metres, got {getattr(self, name)}.")
+                raise ValueError(
+                    f"RegistrationOptions.{name}: expected a positive length in metres, got {getattr(self, name)}."
+                )
         if self.method not in ("gauss-newton", "l-bfgs"):
             raise ValueError(f"RegistrationOptions.method: expected 'gauss-newton' or 'l-bfgs', got {self.method!r}.")
 
 
 @dataclass(frozen=True)
 class Step:
-    """One iteration, for the trace: rms distance (m), objective, largest and mean movement (m), gain over prediction."""
+    """One iteration: rms distance (m), objective, largest and mean movement (m), gain over what was predicted."""
 
     rms_distance: float
     objective: float
@@ -96,7 +98,11 @@ class Registrar:
     """
 
     def __init__(
-        self, model: ForwardModel, objective: CloudObjective, control: Control, options: RegistrationOptions | None = None
+        self,
+        model: ForwardModel,
+        objective: CloudObjective,
+        control: Control,
+        options: RegistrationOptions | None = None,
     ) -> None:
         self.model = model
         self.objective = objective
@@ -153,7 +159,7 @@ def _rms(match: Match) -> float:
 
 
 def _gauss_newton(model: Restricted, registrar: Registrar, cloud: Floats, start: Floats) -> _Found:
-    """Trust-region Gauss-Newton. The noise is lowered with the residual, so that a far start does not overfit its way."""
+    """Trust-region Gauss-Newton. The noise falls with the residual, so that a far start does not overfit its way."""
     options, objective = registrar.options, registrar.objective
     coefficients, limit = start, options.max_step
     match = objective.match(model.solve_coefficients(coefficients), cloud)
@@ -170,15 +176,20 @@ def _gauss_newton(model: Restricted, registrar: Registrar, cloud: Floats, start:
         while accepted is None and limit > 0.1 * options.step:
             change = quadratic.step(limit)
             evaluations += 1
-            accepted, gain = _try(model, objective, cloud, coefficients + change, noise, value, quadratic.decrease(change))
+            accepted, gain = _try(
+                model, objective, cloud, coefficients + change, noise, value, quadratic.decrease(change)
+            )
             limit = _next_limit(limit, quadratic.largest_movement(change), gain)
         if accepted is None:
             reason = "no step lowers the objective further"
             break
         coefficients, match = coefficients + change, accepted
         step = Step(
-            _rms(match), _value(match, coefficients, noise), quadratic.largest_movement(change),
-            quadratic.mean_movement(change), gain,
+            _rms(match),
+            _value(match, coefficients, noise),
+            quadratic.largest_movement(change),
+            quadratic.mean_movement(change),
+            gain,
         )
         trace.append(step)
         settled = noise == options.noise and step.mean_movement < options.step
@@ -195,7 +206,13 @@ def _value(match: Match, coefficients: Floats, noise: float) -> float:
 
 
 def _try(
-    model: Restricted, objective: CloudObjective, cloud: Floats, trial: Floats, noise: float, value: float, expected: float
+    model: Restricted,
+    objective: CloudObjective,
+    cloud: Floats,
+    trial: Floats,
+    noise: float,
+    value: float,
+    expected: float,
 ) -> tuple[Match | None, float]:
     """The match at a trial and its gain over the prediction; None where the objective does not fall."""
     try:

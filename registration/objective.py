@@ -112,7 +112,7 @@ class CloudObjective:
         self._rest = body.points[self.nodes]
 
     def match(self, displacement: Floats, cloud: Floats) -> Match:
-        """Match a cloud (p, 3) to the surface moved by the displacement (m, 3) of the observed nodes `nodes`, metres."""
+        """Match a cloud (p, 3) to the surface moved by the displacement (m, 3) of the nodes `nodes`, metres."""
         positions = self._rest + displacement
         triangles, closest = self._closest.find(positions, cloud)
         corners = positions[self.triangles[triangles]]

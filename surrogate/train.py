@@ -20,7 +20,7 @@ from typing import Any, Literal
 import lightning
 import numpy as np
 import torch
-from lightning.fabric.plugins.environments import LightningEnvironment
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from torch import Tensor
 from tqdm import tqdm

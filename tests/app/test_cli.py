@@ -66,7 +66,10 @@ def cloud(folder: Path, body: Body, shift: float = 0.0) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", ["", "build", "register", "generate", "mesh", "train", "validate", "report", "quickstart", "doctor", "config"])
+@pytest.mark.parametrize(
+    "command",
+    ["", "build", "register", "generate", "mesh", "train", "validate", "report", "quickstart", "doctor", "config"],
+)
 def test_help_reads(capsys, command: str) -> None:
     text = run(capsys, *command.split(), "--help")
     assert "Usage:" in text and len(text.splitlines()) > 4
@@ -147,7 +150,10 @@ def test_a_self_intersecting_surface_is_refused(capsys, tmp_path, sphere, cap) -
     assert "intersect" in said
 
 
-@pytest.mark.parametrize(("flag", "value", "named"), [("--young-modulus", "-3", "material.young_modulus"), ("--poisson-ratio", "0.5", "material.poisson_ratio")])
+@pytest.mark.parametrize(
+    ("flag", "value", "named"),
+    [("--young-modulus", "-3", "material.young_modulus"), ("--poisson-ratio", "0.5", "material.poisson_ratio")],
+)
 def test_materials_that_cannot_be_are_named(capsys, tmp_path, sphere, flag, value, named) -> None:
     assert named in build(capsys, tmp_path, sphere, flag, value)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.shapes import beam, liver_phantom
 

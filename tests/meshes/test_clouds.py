@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.clouds import CloudError, check_cloud, partial_view, sample, thin, visible_triangles
 from softtwin.meshes.embedding import embed

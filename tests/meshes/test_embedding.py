@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.embedding import carried, embed
 

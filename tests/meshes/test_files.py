@@ -4,6 +4,7 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
+
 from softtwin.meshes.body import Body, BodyError, Surface
 from softtwin.meshes.files import (
     FileError,

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from softtwin.meshes.body import Body
 from softtwin.meshes.metrics import (
     cell_volumes,

@@ -3,6 +3,7 @@ import threading
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import embed
 from softtwin.meshes.metrics import mesh_quality

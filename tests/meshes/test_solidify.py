@@ -3,6 +3,7 @@ import signal
 
 import numpy as np
 import pytest
+
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.metrics import tetrahedron_quality
 from softtwin.meshes.solidify import SurfaceError, checked_surface, intersecting_triangles, repair, solidify

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping
 
 import pytest
+
 from softtwin.app import doctor
 from softtwin.app.doctor import Check
 

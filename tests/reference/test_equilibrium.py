@@ -137,7 +137,7 @@ def test_compression_past_buckling_is_reported_unstable(tetrahedral_beam: Body) 
 
 def test_a_load_no_body_can_carry_raises_with_advice(tetrahedral_beam: Body) -> None:
     with Problem(tetrahedral_beam, SaintVenantKirchhoff(E, 0.3), NewtonOptions(max_load_steps=4)) as problem:
-        with pytest.raises(NotConverged, match="of the load was reached.*Try"):
+        with pytest.raises(NotConverged, match=r"of the load was reached.*Try"):
             problem.solve(-1e4 * bending(tetrahedral_beam, 1.0)[:, [2, 0, 1]])
         assert problem.solve(bending(tetrahedral_beam, 0.1)).is_stable  # the problem is usable afterwards
 
@@ -156,10 +156,17 @@ def test_forces_of_the_wrong_shape_are_refused(problem: Problem) -> None:
 
 
 @pytest.mark.parametrize("material", [NeoHookean, SaintVenantKirchhoff])
-@pytest.mark.parametrize(("young", "poisson", "named"), [
-    (0.0, 0.3, "young_modulus"), (-5.0, 0.3, "young_modulus"), (np.nan, 0.3, "young_modulus"),
-    (1e3, 0.5, "poisson_ratio"), (1e3, 0.0, "poisson_ratio"), (1e3, -0.2, "poisson_ratio"),
-])
+@pytest.mark.parametrize(
+    ("young", "poisson", "named"),
+    [
+        (0.0, 0.3, "young_modulus"),
+        (-5.0, 0.3, "young_modulus"),
+        (np.nan, 0.3, "young_modulus"),
+        (1e3, 0.5, "poisson_ratio"),
+        (1e3, 0.0, "poisson_ratio"),
+        (1e3, -0.2, "poisson_ratio"),
+    ],
+)
 def test_materials_that_cannot_be_are_refused(material, young: float, poisson: float, named: str) -> None:
     with pytest.raises(ValueError, match=rf"{material.__name__}\.{named}: expected .* got"):
         material(young, poisson)

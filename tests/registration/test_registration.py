@@ -55,7 +55,9 @@ def body() -> Body:
     return Body(made.points, made.cells, made.node_sets, {"observed": top})
 
 
-def cloud_on(body: Body, displacement: np.ndarray, count: int, rng: np.random.Generator, noise: float = 0.0) -> np.ndarray:
+def cloud_on(
+    body: Body, displacement: np.ndarray, count: int, rng: np.random.Generator, noise: float = 0.0
+) -> np.ndarray:
     triangles = body.surfaces["observed"][rng.integers(len(body.surfaces["observed"]), size=count)]
     weights = rng.dirichlet(np.ones(3), size=count)
     points = np.einsum("pk,pki->pi", weights, (body.points + displacement)[triangles])
@@ -120,7 +122,10 @@ def test_the_trace_never_rises_at_equal_noise(body: Body, rng) -> None:
     model = Cantilever(body)
     cloud = cloud_on(body, model.solve(tip_forces(body, (0.0, 0.5, -1.5))), 200, rng)
     registrar = Registrar(
-        model, CloudObjective(body, body.surfaces["observed"]), nodal_control(body, body.node_sets["tip"]), RegistrationOptions(noise=1e-3)
+        model,
+        CloudObjective(body, body.surfaces["observed"]),
+        nodal_control(body, body.node_sets["tip"]),
+        RegistrationOptions(noise=1e-3),
     )
     distances = [step.rms_distance for step in registrar.register(cloud).trace]
     assert len(distances) > 2 and (np.diff(distances) < 1e-4).all()
@@ -172,7 +177,9 @@ def test_zones_inside_or_fixed_are_refused(body: Body) -> None:
 def test_sequences_start_warm_and_refuse_bad_clouds(body: Body, rng) -> None:
     model = Cantilever(body)
     clouds = [cloud_on(body, model.solve(tip_forces(body, (0.0, 0.0, f))), 150, rng) for f in (-1.0, -1.02)]
-    registrar = Registrar(model, CloudObjective(body, body.surfaces["observed"]), nodal_control(body, body.node_sets["tip"]))
+    registrar = Registrar(
+        model, CloudObjective(body, body.surfaces["observed"]), nodal_control(body, body.node_sets["tip"])
+    )
     cold, warm = register_sequence(registrar, clouds)
     assert warm.evaluations < cold.evaluations
     bad = clouds[0].copy()
