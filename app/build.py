@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +30,7 @@ from softtwin.reference.loads import LoadPlan
 from .config import BodySection, Config, ConfigError, read_config
 
 Ints = NDArray[np.int64]
-SHAPES = {"liver-phantom": liver_phantom, "propeller": propeller, "beam": beam}
+SHAPES: dict[str, Callable[..., Body]] = {"liver-phantom": liver_phantom, "propeller": propeller, "beam": beam}
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,8 @@ def generate_stage(space: Workspace, redo: tuple[int, ...] = ()) -> DataSet | No
         DataSetError: the folder holds a data set of another configuration.
     """
     from softtwin.reference.dataset import drop_block  # FEniCSx is needed by this stage alone
-    from softtwin.reference.generate import MPI, Plan, generate
+    from softtwin.reference.fenicsx import MPI
+    from softtwin.reference.generate import Plan, generate
 
     if not space.body.exists():
         raise ConfigError(f"generate: expected the body in {space.body}, found none; run `softtwin mesh` first.")

@@ -102,7 +102,7 @@ class Problem:
         self._bc = dirichlet(space, blocks[body.fixed])
         self._state = fem.Function(space)
         # What stresses rounded to machine precision leave of a residual that should vanish, newtons.
-        self._round_off = 64.0 * np.finfo(float).eps * material.young_modulus * body.size**2
+        self._round_off = float(64.0 * np.finfo(float).eps * material.young_modulus * body.size**2)
         self._compile(domain, space)
         self._prepare_solver()
 

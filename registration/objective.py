@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,7 +52,12 @@ class ClosestPoints:
         locator = vtkStaticCellLocator()
         locator.SetDataSet(self._surface)
         locator.BuildLocator()
-        cell, number, part, squared = vtkGenericCell(), mutable(0), mutable(0), mutable(0.0)
+        cell = vtkGenericCell()
+        # VTK writes its answers into these; its stubs know plain numbers only.
+        number: Any
+        part: Any
+        squared: Any
+        number, part, squared = mutable(0), mutable(0), mutable(0.0)
         triangles = np.empty(len(cloud), dtype=np.int64)
         closest = np.empty((len(cloud), 3))
         place = [0.0, 0.0, 0.0]

@@ -12,19 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softtwin.app import report
+from softtwin.app import pictures, report
 from softtwin.app.build import Workspace
 from softtwin.app.config import Config
-from softtwin.app.report import (
-    Studio,
-    camera_side,
-    figure,
-    inner_colours,
-    public_config,
-    report_stage,
-    view_of,
-    without_paths,
-)
+from softtwin.app.pictures import Studio, camera_side, view_of
+from softtwin.app.report import figure, inner_colours, public_config, report_stage, without_paths
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
@@ -190,7 +182,7 @@ def test_pictures_are_not_empty(body: Body) -> None:
     if problem := report.rendering_problem():
         pytest.skip(problem)
     view = view_of(camera_side(body), [body.points])
-    image = report._render(view, report.organ_layers(body), 200)
+    image = pictures._render(view, report.organ_layers(body), 200)
     assert image.shape[1:] == (200, 4)
     covered = (image[:, :, 3] > 0).mean()
     assert 0.2 < covered < 0.95  # the body is in the middle of a transparent ground

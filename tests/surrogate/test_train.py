@@ -119,6 +119,16 @@ def test_ctrl_c_is_a_keyboard_interrupt_and_leaves_a_whole_checkpoint(
     assert _same(train(data, short, tmp_path), train(data, short))
 
 
+def test_a_polite_kill_ends_the_program_and_leaves_a_whole_checkpoint(
+    data: DataSet, short: TrainingPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        _stop_in_round(patch, 3, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        with pytest.raises(SystemExit):
+            train(data, short, tmp_path)
+    assert _same(train(data, short, tmp_path), train(data, short))
+
+
 def test_the_time_budget_is_met(data: DataSet, small_plan: TrainingPlan) -> None:
     surrogate = train(data, replace(small_plan, epochs=None, seconds=1.0))
     # generous: the time of a step is measured on a machine that others use
