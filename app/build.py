@@ -245,6 +245,7 @@ def generate_stage(space: Workspace, redo: tuple[int, ...] = ()) -> DataSet | No
         DataSetError: the folder holds a data set of another configuration.
     """
     from softtwin.reference.dataset import drop_block  # FEniCSx is needed by this stage alone
+    from softtwin.reference.equilibrium import NewtonOptions
     from softtwin.reference.fenicsx import MPI
     from softtwin.reference.generate import Plan, generate
 
@@ -260,6 +261,7 @@ def generate_stage(space: Workspace, redo: tuple[int, ...] = ()) -> DataSet | No
         block=samples.block,
         path=samples.path,
         seed=samples.seed,
+        newton=NewtonOptions(**space.config.solver.model_dump()),
     )
     if MPI.COMM_WORLD.rank == 0:
         for block in redo:

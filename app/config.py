@@ -89,6 +89,14 @@ class SamplesSection(_Section):
     ranks: int = Field(0, ge=0, description="MPI ranks that build and quickstart start; 0: one a core")
 
 
+class SolverSection(_Section):
+    """Newton's method in the reference."""
+
+    tolerance: float = Field(1e-8, gt=0.0, lt=1.0, description="residual relative to the forces")
+    max_iterations: Count = Field(60, description="iterations of one load step")
+    max_load_steps: Count = Field(20, description="load steps tried before a draw is rejected")
+
+
 class TrainingSection(_Section):
     """The surrogate."""
 
@@ -120,6 +128,7 @@ class Config(_Section):
     material: MaterialSection = MaterialSection()
     loads: LoadsSection = LoadsSection()
     samples: SamplesSection = SamplesSection()
+    solver: SolverSection = SolverSection()
     training: TrainingSection = TrainingSection()
     registration: RegistrationSection = RegistrationSection()
 

@@ -38,6 +38,7 @@ def liver_config(seconds: float, ranks: int) -> Config:
             "material": {"young_modulus": YOUNG_MODULUS, "poisson_ratio": POISSON_RATIO},
             "loads": {"zones": list(SEQUENCES), "patches": 1, "radius": (0.25, 0.8), "displacement": 0.07},
             "samples": {"train": 1536, "validation": 96, "test": 192, "block": 8, "path": 8, "ranks": ranks},
+            "solver": {"tolerance": 1e-6, "max_iterations": 30, "max_load_steps": 6},
             "training": {"seconds": seconds},
         }
     )

@@ -21,6 +21,7 @@ from typing import Any
 with contextlib.suppress(ImportError):
     import dolfinx_solver  # noqa: F401  the PyPI wheel wants to be imported before dolfinx
 import petsc4py
+from mpi4py import MPI  # before PETSc, which would start MPI without the threads that the task farm needs
 
 # PETSc's own handler turns SIGTERM and SIGPIPE into MPI_Abort; Python's must stay.
 petsc4py.init([sys.argv[0] if sys.argv else "softtwin", "-no_signal_handler"])
@@ -30,7 +31,6 @@ import numpy as np
 import ufl
 from dolfinx import fem, mesh
 from dolfinx.fem import petsc as fem_petsc
-from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
