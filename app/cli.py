@@ -174,6 +174,9 @@ def report(configuration: Path) -> None:
     "--displacement", type=float, default=0.05, show_default=True, help="Largest displacement to learn, metres."
 )
 @click.option("--samples", type=int, default=512, show_default=True, help="Equilibria to learn from.")
+@click.option(
+    "--path", type=int, default=1, show_default=True, help="Draws that share a load at growing sizes (cheaper)."
+)
 @click.option("--seconds", type=float, default=120.0, show_default=True, help="Time to train.")
 @click.option("--ranks", type=int, default=0, help="MPI ranks; 0: one a core.")
 @click.option(
@@ -204,6 +207,7 @@ def build(surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...],
             "validation": max(8, given["samples"] // 8),
             "test": max(8, given["samples"] // 4),
             "ranks": given["ranks"],
+            "path": given["path"],
         },
         "training": {"seconds": given["seconds"]},
     }

@@ -116,7 +116,7 @@ class RegistrationSection(_Section):
     zone: str = Field("", description="zone whose nodes may carry force; empty: all loaded nodes")
     noise: Positive = Field(5e-4, description="expected noise of the cloud, metres")
     force_scale: Positive = Field(0.1, description="expected size of a nodal force, newtons")
-    smoothness: float = Field(0.0, ge=0.0, description="correlation length of neighbouring forces, metres")
+    smoothness: float = Field(0.02, ge=0.0, description="correlation length of neighbouring forces, metres; 0: none")
     max_iterations: Count = Field(40, description="iterations for one cloud")
 
 

@@ -11,6 +11,7 @@ from softtwin.meshes.body import Body
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+_SMALLEST_VARIANCE = 1e-5  # of a pattern of forces, relative to the largest: rougher ones are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,16 +64,18 @@ def nodal_control(body: Body, nodes: ArrayLike, force_scale: float = 0.1, smooth
             "give the zone that the tool may touch."
         )
     root = force_scale * _correlation_root(body.points[chosen], smoothness)
-    basis = np.zeros((len(body.points), 3, 3 * len(chosen)))
+    basis = np.zeros((len(body.points), 3, 3 * root.shape[1]))
     for axis in range(3):
         basis[chosen, axis, axis::3] = root
-    return Control(chosen, basis.reshape(-1, 3 * len(chosen)))
+    return Control(chosen, basis.reshape(-1, 3 * root.shape[1]))
 
 
 def _correlation_root(positions: Floats, smoothness: float) -> Floats:
+    """Independent patterns of nodal forces, (a, m), whose covariance is the correlation; few where it is smooth."""
     if smoothness <= 0.0:
         return np.eye(len(positions))
     squared = ((positions[:, None] - positions[None]) ** 2).sum(axis=2)
     correlation = np.exp(-squared / (2.0 * smoothness**2))
-    # A tenth of a per cent of independent variance keeps the factorisation positive.
-    return np.linalg.cholesky(correlation + 1e-3 * np.eye(len(positions)))
+    variances, modes = np.linalg.eigh(correlation)
+    kept = variances > _SMALLEST_VARIANCE * variances[-1]
+    return modes[:, kept] * np.sqrt(variances[kept])

@@ -1,0 +1,143 @@
+"""The main job, small: the same path from shape to report, and what a user does with the twin it leaves."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+pytest.importorskip("torch", reason="torch is absent")
+
+from softtwin.app.cli import main
+from softtwin.meshes.files import read_body, write_body
+
+
+def softtwin(*arguments: object) -> int:
+    try:
+        main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished small quickstart, run as a user runs it."""
+    folder = tmp_path_factory.mktemp("quickstart") / "out"
+    command = [sys.executable, "-m", "softtwin.app.cli", "quickstart", "--small", "--output", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=400, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "not a medical device" in done.stdout
+    assert done.stdout.strip().splitlines()[-1] == f"open {folder / 'report.html'}"
+    assert "Traceback" not in done.stderr and "Warning" not in done.stderr, done.stderr
+    return folder
+
+
+@pytest.fixture
+def copy(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def test_every_stage_left_its_result(made: Path) -> None:
+    for name in (
+        "organ.toml",
+        "body.vtu",
+        "data.zarr",
+        "twin",
+        "validation.json",
+        "demo",
+        "report.html",
+        "stages.json",
+    ):
+        assert (made / name).exists(), name
+    assert {"mesh", "generate", "train", "validate", "demo", "report"} <= set(
+        json.loads((made / "stages.json").read_text())
+    )
+    assert {"body.vtu", "organ.toml", "surrogate.json", "surrogate.safetensors"} <= {
+        p.name for p in (made / "twin").iterdir()
+    }
+
+
+@pytest.mark.parametrize(("model", "factor"), [("surrogate", 4.0), ("reference", 8.0)])
+def test_registration_finds_the_tumour(made: Path, model: str, factor: float) -> None:
+    """The tumour's error falls by a clear factor; a registration that does nothing, or pulls rigidly, would fail."""
+    frame = json.loads((made / "demo" / model / "registration.json").read_text())["frames"][0]
+    tumour = frame["targets"]["tumour"]
+    truth = np.load(made / "demo" / "truth.npy")
+    before = frame["targets"]["tumour"]["movement_m"]
+    assert before > 5e-3 and np.linalg.norm(truth, axis=1).max() > 0.02
+    assert tumour["error_m"] < before / factor
+
+
+def test_the_card_says_what_the_twin_is(made: Path) -> None:
+    card = json.loads((made / "twin" / "surrogate.json").read_text())
+    assert "not a medical device" in card["notice"].lower()
+    assert card["held_out"]["samples"] > 0
+
+
+def test_running_again_makes_nothing_twice(copy: Path, capsys) -> None:
+    """The second run finds mesh and equilibria: their files keep their times."""
+    stamps = {path: path.stat().st_mtime_ns for path in (copy / "body.vtu", copy / "data.zarr" / "zarr.json")}
+    begin = time.perf_counter()
+    assert softtwin("quickstart", "--small", "--output", copy) == 0
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
+    assert time.perf_counter() - begin < 200
+    capsys.readouterr()
+
+
+def test_the_twin_registers_a_sequence_without_the_reference(made: Path, tmp_path: Path, capsys) -> None:
+    cloud = np.load(made / "demo" / "cloud.npy")
+    paths = []
+    for i, shift in enumerate((0.0, 2e-4)):
+        paths.append(tmp_path / f"{i}.txt")
+        np.savetxt(paths[-1], 1e3 * (cloud + shift))
+    output = tmp_path / "found"
+    words = ["register", made / "twin", *paths, "--unit", "mm", "--smoothness", 0.02, "--output", output]
+    assert softtwin(*words) == 0
+    said = capsys.readouterr().out
+    assert said.count("cloud to surface") == 2 and "tumour moved" in said
+    frames = json.loads((output / "registration.json").read_text())["frames"]
+    assert max(frame["rms_distance_m"] for frame in frames) < 3e-3
+    assert (output / "frame_0001.vtu").exists()
+
+
+def test_validate_and_report_run_alone(copy: Path, capsys) -> None:
+    assert softtwin("validate", copy / "organ.toml") == 0
+    assert "cosine of J^T g" in capsys.readouterr().out
+    (copy / "report.html").unlink()
+    assert softtwin("report", copy / "organ.toml") == 0
+    assert (copy / "report.html").stat().st_size > 100_000
+    capsys.readouterr()
+
+
+def test_a_body_that_does_not_match_is_refused(copy: Path, capsys) -> None:
+    body = read_body(copy / "twin" / "body.vtu")
+    other = body.with_sets(fixed=body.fixed[1:])
+    write_body(copy / "twin" / "body.vtu", other)
+    assert softtwin("register", copy / "twin", copy / "demo" / "cloud.npy") == 2
+    assert "belongs to another body" in capsys.readouterr().err
+
+
+def test_truncated_weights_are_refused(copy: Path, capsys) -> None:
+    weights = copy / "twin" / "surrogate.safetensors"
+    weights.write_bytes(weights.read_bytes()[:1000])
+    assert softtwin("register", copy / "twin", copy / "demo" / "cloud.npy") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and "surrogate.safetensors" in said
+
+
+def test_a_truncated_checkpoint_is_refused_with_advice(copy: Path, capsys) -> None:
+    checkpoint = next((copy / "training").glob("*.ckpt"))
+    checkpoint.write_bytes(checkpoint.read_bytes()[:500])
+    assert softtwin("train", copy / "organ.toml") == 2
+    assert "training.ckpt" in capsys.readouterr().err
+    assert softtwin("train", copy / "organ.toml", "--fresh") == 0
+    capsys.readouterr()
