@@ -30,6 +30,7 @@ from softtwin.reference.loads import LoadPlan
 from .config import BodySection, Config, ConfigError, read_config
 
 Ints = NDArray[np.int64]
+_JOB_VARIABLES = ("PMIX_", "ORTE_", "OMPI_MCA_orte", "OMPI_MCA_ess", "OMPI_COMM_", "OMPI_UNIVERSE", "OMPI_APP_CTX")
 SHAPES: dict[str, Callable[..., Body]] = {"liver-phantom": liver_phantom, "propeller": propeller, "beam": beam}
 
 
@@ -280,7 +281,9 @@ def generate_in_parallel(config_path: Path, ranks: int) -> None:
     if ranks == 1 or shutil.which("mpirun") is None:
         generate_stage(open_workspace(config_path))
         return
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    # A caller that runs MPI itself hands down the names of its own job, which mpirun would take for its.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(_JOB_VARIABLES)}
+    environment["OPENBLAS_NUM_THREADS"] = "1"
     if sys.stderr.isatty():
         environment["SOFTTWIN_PROGRESS"] = "1"
     if os.geteuid() == 0:

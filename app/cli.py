@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 import sys
 import warnings
@@ -11,6 +12,7 @@ from typing import Any
 
 import click
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.files import UnitWarning
 
@@ -245,8 +247,11 @@ def quickstart(output: Path, small: bool) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors of the input are one message and exit code 2, not a traceback."""
     warnings.showwarning = _show_warning
+    # Ranks are the parallelism: on meshes of an organ's size several BLAS threads in one process only wait for another.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        softtwin.main(args=arguments, standalone_mode=False)
+        with threadpool_limits(int(os.environ["OPENBLAS_NUM_THREADS"]), "blas"):
+            softtwin.main(args=arguments, standalone_mode=False)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)

@@ -66,7 +66,7 @@ def forward_model(name: str, folder: Path, body: Body, config: Config) -> Iterat
 
     material = MATERIALS[config.material.law](config.material.young_modulus, config.material.poisson_ratio)
     with Problem(body, material, NewtonOptions(tolerance=1e-5, max_iterations=15)) as problem:
-        yield ReferenceModel(problem)
+        yield ReferenceModel(problem, patient=False)
 
 
 def make_registrar(model: ForwardModel, config: Config, section: RegistrationSection) -> Registrar:

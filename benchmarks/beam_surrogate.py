@@ -19,7 +19,6 @@ from softtwin.app.chain import prepare
 from softtwin.app.config import Config
 from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.adjoint import ReferenceModel
 from softtwin.reference.dataset import DataSet, Samples
 from softtwin.reference.equilibrium import Problem
 from softtwin.reference.generate import plan_from_header
@@ -59,7 +58,7 @@ def main() -> None:
         few = Samples(
             *(getattr(test, name)[:100] for name in ("draws", "forces", "displacements", "probes", "adjoints"))
         )
-        adjoint = adjoint_of(ReferenceModel(problem))
+        adjoint = adjoint_of(problem)
         for name, training in plans.items():
             begin = time.perf_counter()
             surrogate = train(data, training)
@@ -84,14 +83,9 @@ def main() -> None:
     write("beam_surrogate", figures)
 
 
-def adjoint_of(model: ReferenceModel):
-    """The exact gradient J^T g at the state of given forces."""
-
-    def adjoint(forces, cotangent):
-        model.solve(forces)
-        return model.pullback(cotangent)
-
-    return adjoint
+def adjoint_of(problem: Problem):
+    """The exact gradient K(u)^-1 g, (n, 3), at a state u for a cotangent g."""
+    return lambda displacement, cotangent: problem.apply_inverse(cotangent.ravel(), displacement).reshape(-1, 3)
 
 
 if __name__ == "__main__":

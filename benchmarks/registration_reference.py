@@ -24,14 +24,19 @@ from softtwin.registration.objective import CloudObjective
 from softtwin.registration.sequence import register_sequence
 
 
-def run(data: Sequence, problem: Problem, frames: int, options: RegistrationOptions) -> list[dict[str, float]]:
+def run(
+    data: Sequence, problem: Problem, frames: int, options: RegistrationOptions, smoothness: float
+) -> list[dict[str, float]]:
     """Errors, forces and times of every frame of a sequence."""
     body = problem.body
     rest = liver("default").points
     carrier = embed(body, rest)
-    model = ReferenceModel(problem)
+    model = ReferenceModel(problem, patient=False)
     registrar = Registrar(
-        model, CloudObjective(body, body.surfaces["observed"]), nodal_control(body, data.zone), options
+        model,
+        CloudObjective(body, body.surfaces["observed"]),
+        nodal_control(body, data.zone, smoothness=smoothness),
+        options,
     )
     rows = []
     for i, result in enumerate(register_sequence(registrar, data.clouds[:frames])):
@@ -80,17 +85,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=50)
     parser.add_argument("--noise", type=float, default=1e-4)
+    parser.add_argument("--smoothness", type=float, default=0.0)
     parser.add_argument("--mesh", choices=["default", "remeshed"], default="default")
     parser.add_argument("--attachment", choices=["facets", "listed"], default="facets")
     parser.add_argument("--sequences", nargs="+", default=list(SEQUENCES))
     arguments = parser.parse_args()
     body = liver(arguments.mesh, arguments.attachment)
     options = RegistrationOptions(noise=arguments.noise)
-    figures = {"noise": arguments.noise, "mesh": arguments.mesh, "attachment": arguments.attachment, "sequences": {}}
+    figures = {
+        "noise": arguments.noise,
+        "smoothness": arguments.smoothness,
+        "mesh": arguments.mesh,
+        "attachment": arguments.attachment,
+        "sequences": {},
+    }
     newton = NewtonOptions(tolerance=1e-5, max_iterations=15)
     with Problem(body, NeoHookean(YOUNG_MODULUS, POISSON_RATIO), newton) as problem:
         for name in arguments.sequences:
-            rows = run(sequence(name, arguments.mesh), problem, arguments.frames, options)
+            rows = run(sequence(name, arguments.mesh), problem, arguments.frames, options, arguments.smoothness)
             figures["sequences"][name] = {"summary": summary(rows), "frames": rows}
             print(name, {key: round(value, 4) for key, value in summary(rows).items()}, flush=True)
     write(f"registration_reference_{arguments.mesh}_{arguments.attachment}", figures)

@@ -25,10 +25,13 @@ class ReferenceModel:
 
     Args:
         problem: body, material and options; stays owned by the caller.
+        patient: try the other ways where the nearest state is too far; False refuses at once, for a search that can
+            shorten its step.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, patient: bool = True) -> None:
         self._problem = problem
+        self._patient = patient
         self.reset()
 
     def reset(self) -> None:
@@ -64,7 +67,7 @@ class ReferenceModel:
             found = nearest[1]
         else:
             guess = self._ahead(nearest[1].displacement, load - nearest[0])
-            found = self._problem.solve(load, guess, stability=False, fallback=False)
+            found = self._problem.solve(load, guess, stability=False, fallback=self._patient)
         self._states.append((load, found))
         return found.displacement
 
