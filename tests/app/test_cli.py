@@ -13,6 +13,7 @@ import trimesh
 from softtwin.app.build import make_body
 from softtwin.app.cli import main
 from softtwin.app.config import BodySection, Config, to_toml
+from softtwin.app.register import forward_model, make_registrar, open_twin, register_clouds
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.files import read_body, write_body
@@ -219,6 +220,23 @@ def test_unknown_zones_are_named(capsys, twin: Path) -> None:
     found = cloud(twin, read_body(twin / "body.vtu"))
     said = run(capsys, "register", twin, found, "--model", "reference", "--zone", "nowhere", code=2)
     assert "registration.zone" in said and "nowhere" in said
+
+
+def test_ctrl_c_between_frames_keeps_the_frames_before(twin: Path, tmp_path: Path) -> None:
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    body, settings = open_twin(twin)
+    points = np.load(cloud(twin, body))
+
+    def interrupted(line: str) -> None:
+        if line.startswith("frame   1"):
+            raise KeyboardInterrupt
+
+    with forward_model("reference", twin, body, settings) as model, pytest.raises(KeyboardInterrupt):
+        registrar = make_registrar(model, settings, settings.registration)
+        register_clouds(registrar, [points] * 3, tmp_path / "found", say=interrupted)
+    frames = json.loads((tmp_path / "found" / "registration.json").read_text())["frames"]
+    assert [frame["frame"] for frame in frames] == [0, 1]
+    assert (tmp_path / "found" / "frame_0001.vtu").exists()
 
 
 def test_ctrl_c_is_one_line_and_code_130(capsys, monkeypatch) -> None:
