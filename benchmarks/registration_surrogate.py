@@ -10,10 +10,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequence
+from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
 from record import write
-from registration_reference import summary
+from registration_reference import run, summary
 from threadpoolctl import threadpool_limits
 
 from softtwin.app.build import Workspace, generate_in_parallel
@@ -21,11 +20,7 @@ from softtwin.app.chain import prepare
 from softtwin.app.config import Config
 from softtwin.app.learn import train_stage, validate_stage
 from softtwin.meshes.files import write_body
-from softtwin.registration.control import nodal_control
-from softtwin.registration.forward import ForwardModel
-from softtwin.registration.minimise import Registrar, RegistrationOptions
-from softtwin.registration.objective import CloudObjective
-from softtwin.registration.sequence import register_sequence
+from softtwin.registration.minimise import RegistrationOptions
 
 RUNS = Path(__file__).parent / "runs"
 
@@ -54,34 +49,6 @@ def make_twin(seconds: float, ranks: int, folder: Path) -> Workspace:
     return space
 
 
-def run(data: Sequence, model: ForwardModel, frames: int, noise: float, smoothness: float) -> list[dict[str, float]]:
-    """Errors, forces and times of every frame."""
-    body = model.body
-    control = nodal_control(body, data.zone, force_scale=0.1, smoothness=smoothness)
-    registrar = Registrar(
-        model, CloudObjective(body, body.surfaces["observed"]), control, RegistrationOptions(noise=noise)
-    )
-    rows = []
-    for i, result in enumerate(register_sequence(registrar, data.clouds[:frames])):
-        errors = 1e3 * np.linalg.norm(result.displacement - (data.positions[i] - body.points), axis=1)
-        true = data.net_forces[i]
-        difference = float(np.linalg.norm(result.net_force - true))
-        rows.append(
-            {
-                "frame": i,
-                "tre_mm": errors.mean(),
-                "tre_p95_mm": np.quantile(errors, 0.95),
-                "tre_max_mm": errors.max(),
-                "force_error_N": difference,
-                "force_error": difference / float(np.linalg.norm(true)),
-                "rms_distance_mm": 1e3 * result.rms_distance,
-                "seconds": result.seconds,
-                "iterations": len(result.trace),
-            }
-        )
-    return rows
-
-
 def main() -> None:
     from softtwin.surrogate.predictor import load
 
@@ -99,9 +66,10 @@ def main() -> None:
     model = load(twin, body)
     figures = {"noise": arguments.noise, "smoothness": arguments.smoothness, "sequences": {}}
     figures["held_out"] = model.card.get("held_out")
+    options = RegistrationOptions(noise=arguments.noise)
     with threadpool_limits(1):
         for name in SEQUENCES:
-            rows = run(sequence(name), model, arguments.frames, arguments.noise, arguments.smoothness)
+            rows = run(sequence(name), model, arguments.frames, options, arguments.smoothness)
             figures["sequences"][name] = {"summary": summary(rows), "frames": rows}
             print(name, {key: round(value, 4) for key, value in summary(rows).items()}, flush=True)
     write("registration_surrogate", figures)

@@ -163,6 +163,7 @@ class Problem:
     def _reset_run(self) -> None:
         self._norms: list[float] = []
         self._search_failed = False
+        self._reached: float | None = None  # potential where the last step led
         self._factorisations = 0
 
     def _snes_function(self, snes: Any, x: Any, f: Any) -> None:
@@ -206,8 +207,7 @@ class Problem:
     def _snes_precheck(self, x: Any, y: Any) -> bool:
         """Shorten (or turn) the Newton direction until the energy decreases enough; SNES then takes x - y whole."""
         unknowns, step = x.array_r, y.array.copy()
-        self._assemble_residual(unknowns, self._residual)
-        slope = -float(self._residual.array_r @ step)
+        slope = -float(self._residual.array_r @ step)  # SNES has left the residual at x in the vector it was given
         if slope > 0.0:  # an indefinite tangent may point uphill
             step, slope = -step, -slope
         length = self._search(unknowns, step, slope)
@@ -217,12 +217,13 @@ class Problem:
 
     def _search(self, unknowns: Floats, step: Floats, slope: float) -> float:
         """Armijo's rule on the energy with quadratic interpolation; a step that turns a cell inside out is refused."""
-        start = self._potential(unknowns)
+        start = self._potential(unknowns) if self._reached is None else self._reached
         noise = _ROUND_OFF * (abs(start) + abs(float(self._forces @ unknowns)))
         length = 1.0
         while length > _SMALLEST_STEP:
             change = self._potential(unknowns - length * step) - start
             if change <= _ARMIJO * length * slope + noise:
+                self._reached = start + change
                 return length
             best = -slope * length / (2.0 * (change / length - slope)) if np.isfinite(change) else 0.5 * length
             length = float(np.clip(best, 0.1 * length, 0.5 * length))
@@ -306,6 +307,7 @@ class Problem:
         self._forces = load
         self._norms = []
         self._search_failed = False
+        self._reached = None
         self._absolute_tolerance = max(self.options.tolerance * float(np.linalg.norm(load)), self._round_off)
         self._iteration_limit = self.options.max_iterations
         start = self._no_worse_than_rest(start)
