@@ -6,9 +6,10 @@ import json
 import shutil
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
-import trimesh
+import pyvista
 
 from softtwin.app.build import make_body
 from softtwin.app.cli import main
@@ -32,17 +33,26 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object, code: int = 0) -
     return captured.out + captured.err
 
 
+def ball() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a sphere of radius 50."""
+    made = pyvista.Icosphere(radius=50.0, nsub=3)
+    return np.asarray(made.points, dtype=np.float64), np.asarray(made.regular_faces)
+
+
+def write_stl(path: Path, points: np.ndarray, triangles: np.ndarray) -> Path:
+    meshio.Mesh(points, [("triangle", triangles)]).write(path, binary=True)
+    return path
+
+
 @pytest.fixture
 def sphere(tmp_path: Path) -> Path:
-    path = tmp_path / "sphere_mm.stl"
-    trimesh.creation.icosphere(subdivisions=3, radius=50.0).export(path)
-    return path
+    return write_stl(tmp_path / "sphere_mm.stl", *ball())
 
 
 @pytest.fixture
 def cap(tmp_path: Path) -> Path:
     """Points of the sphere's lower cap, in millimetres."""
-    points = trimesh.creation.icosphere(subdivisions=3, radius=50.0).vertices
+    points, _ = ball()
     path = tmp_path / "cap.txt"
     np.savetxt(path, points[points[:, 2] < -35.0])
     return path
@@ -125,29 +135,26 @@ def test_millimetres_read_as_metres_are_warned_of(capsys, tmp_path, sphere, cap)
     assert "warning" in said and "--unit mm" in said and "100" in said
 
 
-def test_an_open_surface_is_refused(capsys, tmp_path, sphere, cap) -> None:
-    whole = trimesh.load(sphere)
-    whole.update_faces(np.arange(len(whole.faces)) > 20)
-    whole.export(tmp_path / "open.stl")
-    said = build(capsys, tmp_path, tmp_path / "open.stl", "--unit", "mm", "--fixed", cap)
+def test_an_open_surface_is_refused(capsys, tmp_path, cap) -> None:
+    points, triangles = ball()
+    path = write_stl(tmp_path / "open.stl", points, triangles[20:])
+    said = build(capsys, tmp_path, path, "--unit", "mm", "--fixed", cap)
     assert "open" in said and "repair" in said
 
 
-def test_two_components_are_refused(capsys, tmp_path, sphere, cap) -> None:
-    one = trimesh.load(sphere)
-    two = one.copy()
-    two.apply_translation((200.0, 0.0, 0.0))
-    trimesh.util.concatenate([one, two]).export(tmp_path / "two.stl")
-    said = build(capsys, tmp_path, tmp_path / "two.stl", "--unit", "mm", "--fixed", cap)
+def test_two_components_are_refused(capsys, tmp_path, cap) -> None:
+    points, triangles = ball()
+    both = np.vstack([points, points + np.array([200.0, 0.0, 0.0])]))
+    path = write_stl(tmp_path / "two.stl", both, np.vstack([triangles, triangles + len(points)]))
+    said = build(capsys, tmp_path, path, "--unit", "mm", "--fixed", cap)
     assert "component" in said and "2" in said
 
 
-def test_a_self_intersecting_surface_is_refused(capsys, tmp_path, sphere, cap) -> None:
-    folded = trimesh.load(sphere)
-    top = folded.vertices[:, 2] > 30.0
-    folded.vertices[top, 2] -= 110.0
-    folded.export(tmp_path / "folded.stl")
-    said = build(capsys, tmp_path, tmp_path / "folded.stl", "--unit", "mm", "--fixed", cap)
+def test_a_self_intersecting_surface_is_refused(capsys, tmp_path, cap) -> None:
+    points, triangles = ball()
+    points[points[:, 2] > 30.0, 2] -= 110.0
+    path = write_stl(tmp_path / "folded.stl", points, triangles)
+    said = build(capsys, tmp_path, path, "--unit", "mm", "--fixed", cap)
     assert "intersect" in said
 
 
