@@ -144,7 +144,7 @@ def test_an_open_surface_is_refused(capsys, tmp_path, cap) -> None:
 
 def test_two_components_are_refused(capsys, tmp_path, cap) -> None:
     points, triangles = ball()
-    both = np.vstack([points, points + np.array([200.0, 0.0, 0.0])]))
+    both = np.vstack([points, points + np.array([200.0, 0.0, 0.0])])
     path = write_stl(tmp_path / "two.stl", both, np.vstack([triangles, triangles + len(points)]))
     said = build(capsys, tmp_path, path, "--unit", "mm", "--fixed", cap)
     assert "component" in said and "2" in said
