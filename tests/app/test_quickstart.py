@@ -6,7 +6,6 @@ import json
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -86,10 +85,8 @@ def test_the_card_says_what_the_twin_is(made: Path) -> None:
 def test_running_again_makes_nothing_twice(copy: Path, capsys) -> None:
     """The second run finds mesh and equilibria: their files keep their times."""
     stamps = {path: path.stat().st_mtime_ns for path in (copy / "body.vtu", copy / "data.zarr" / "zarr.json")}
-    begin = time.perf_counter()
     assert softtwin("quickstart", "--small", "--output", copy) == 0
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
-    assert time.perf_counter() - begin < 200
     capsys.readouterr()
 
 
