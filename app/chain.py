@@ -62,9 +62,10 @@ def make_twin(space: Workspace, path: Path, say: Callable[[str], None]) -> None:
     body = read_body(space.body) if space.body.exists() else mesh_stage(space)
     say(f"    {len(body.points)} nodes, {len(body.cells)} cells, {len(body.fixed)} fixed, {1e3 * body.volume:.2f} l")
     say("2/4 generate: eigenmodes, modal loads, equilibria")
-    if not _complete(space):
-        generate_in_parallel(path, space.config.samples.ranks)
-    say(f"    {describe_data(DataSet(space.data))}")
+    if _complete(space):
+        say(f"    there already: {describe_data(DataSet(space.data))}")
+    else:
+        generate_in_parallel(path, space.config.samples.ranks)  # says itself what it has made
     say("3/4 train: the surrogate")
     train_stage(space)
     say("4/4 validate: held-out errors")
