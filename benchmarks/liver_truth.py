@@ -31,9 +31,8 @@ def main() -> None:
                 state = problem.solve(forces)
                 error = np.abs(problem.body.points + state.displacement - data.positions[frame]).max()
                 figures["largest_error_m"][f"{name} {frame}"] = error
-                print(
-                    f"{name} {frame}: {error:.1e} m, {state.load_steps} load step, {state.negative_pivots} negative pivots"
-                )
+                found = f"{state.load_steps} load step, {state.negative_pivots} negative pivots"
+                print(f"{name} {frame}: {error:.1e} m, {found}")
     print(figures["lone_nodes"], figures["lone_movement_mm"])
     write("liver_truth", figures)
 
