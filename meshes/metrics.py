@@ -204,9 +204,9 @@ def mesh_quality(body: Body) -> MeshQuality:
     Args:
         body: the body.
     """
-    jacobians, volumes = scaled_jacobians(body.points, body.cells), cell_volumes(body.points, body.cells)
-    edges, angles = edge_lengths(body.points, body.cells), dihedral_angles(body.points, body.cells)
-    ratio = tetrahedron_quality(body.points, body.cells).min() if body.is_tetrahedral else np.nan
+    jacobians, volumes = scaled_jacobians(body.points, body.corner_cells), cell_volumes(body.points, body.corner_cells)
+    edges, angles = edge_lengths(body.points, body.corner_cells), dihedral_angles(body.points, body.corner_cells)
+    ratio = tetrahedron_quality(body.points, body.corner_cells).min() if body.is_tetrahedral else np.nan
     return MeshQuality(
         nodes=len(body.points),
         cells=len(body.cells),

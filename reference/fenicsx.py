@@ -34,27 +34,38 @@ from dolfinx.fem import petsc as fem_petsc
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from softtwin.meshes.elements import Kind
+
 __all__ = [
     "MPI",
     "PETSc",
+    "add_facet_matrix",
     "assemble_matrix",
     "assemble_vector",
+    "cell_dofs",
+    "cell_space",
+    "cell_vertices",
+    "collapse",
     "constant",
     "create_matrix",
     "create_mesh",
     "dirichlet",
     "dolfinx",
+    "exterior_facets",
+    "facet_measure",
     "fem",
     "form",
-    "node_dofs",
+    "ghosted_vector",
+    "local_cells",
+    "original_cells",
     "quiet_jit",
     "scalar",
+    "taylor_hood_space",
     "ufl",
     "vector_space",
+    "vtk_order",
 ]
 
-_CELLS = {4: "tetrahedron", 8: "hexahedron"}
-_VTK_TO_DOLFINX = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 # -ffast-math changed residual and tangent by at most 6e-16 and gains up to 100 % of assembly.
 _COMPILE = ["-O3", "-march=native", "-ffast-math"]
 _COMPILE_TIMEOUT_S = 180
@@ -101,25 +112,56 @@ def _compiling(cache: Path) -> Iterator[None]:
         yield
 
 
-def _element(cell: str) -> Any:
-    if hasattr(ufl, "VectorElement"):
-        return ufl.VectorElement("Lagrange", cell, 1)
-    import basix.ufl  # absent from the versions that have ufl.VectorElement
+def _lagrange(cell: str, degree: int, components: int, discontinuous: bool = False) -> Any:
+    """A Lagrange element; one component is a scalar."""
+    if not hasattr(ufl, "VectorElement"):
+        import basix.ufl  # absent from the versions that have ufl.VectorElement
 
-    return basix.ufl.element("Lagrange", cell, 1, shape=(3,))
+        shape = {"shape": (components,)} if components > 1 else {}
+        return basix.ufl.element("Lagrange", cell, degree, discontinuous=discontinuous, **shape)
+    family = ("DQ" if cell in ("quadrilateral", "hexahedron") else "DG") if discontinuous else "Lagrange"
+    if components == 1:
+        return ufl.FiniteElement(family, cell, degree)
+    return ufl.VectorElement(family, cell, degree, components)
 
 
-def create_mesh(points: NDArray[np.float64], cells: NDArray[np.int64], comm: Any = MPI.COMM_SELF) -> Any:
-    """A DOLFINx mesh of linear tetrahedra or hexahedra.
+def _mixed(first: Any, second: Any) -> Any:
+    if hasattr(ufl, "MixedElement"):
+        return ufl.MixedElement(first, second)
+    import basix.ufl
+
+    return basix.ufl.mixed_element([first, second])
+
+
+def _space(domain: Any, element: Any) -> Any:
+    make = getattr(fem, "functionspace", None) or fem.FunctionSpace
+    return make(domain, element)
+
+
+def cell_name(domain: Any) -> str:
+    """Name of a mesh's cells, `tetrahedron` for instance."""
+    name = domain.ufl_cell().cellname
+    return str(name() if callable(name) else name)
+
+
+def vtk_order(kind: Kind) -> list[int]:
+    """Positions in VTK's order of a cell's nodes in DOLFINx's order."""
+    return [int(i) for i in dolfinx.cpp.io.perm_vtk(getattr(mesh.CellType, kind.shape), kind.nodes)]
+
+
+def create_mesh(points: NDArray[np.float64], cells: NDArray[np.int64], kind: Kind, comm: Any = MPI.COMM_SELF) -> Any:
+    """A DOLFINx mesh, cells shared out between the ranks.
 
     Args:
-        points: node positions, (n, 3).
-        cells: node numbers in VTK order, (m, 4) or (m, 8).
-        comm: communicator that shares the mesh.
+        points: node positions, (n, 2) or (n, 3).
+        cells: node numbers in VTK order, (m, k).
+        kind: shape and degree of the cells.
+        comm: communicator that shares the mesh; every rank gives the same arrays.
     """
-    corners = cells.shape[1]
-    domain = ufl.Mesh(_element(_CELLS[corners]))
-    ordered = np.ascontiguousarray(cells[:, _VTK_TO_DOLFINX[corners]])
+    domain = ufl.Mesh(_lagrange(kind.shape, kind.degree, points.shape[1]))
+    ordered = np.ascontiguousarray(cells[:, vtk_order(kind)])
+    if comm.rank != 0:
+        ordered, points = ordered[:0], points[:0]
     names = inspect.signature(mesh.create_mesh).parameters
     with quiet_jit():
         if "e" in names:
@@ -127,25 +169,74 @@ def create_mesh(points: NDArray[np.float64], cells: NDArray[np.int64], comm: Any
         return mesh.create_mesh(comm, cells=ordered, x=points, domain=domain, ghost_mode=mesh.GhostMode.none)
 
 
-def vector_space(domain: Any) -> Any:
-    """Continuous piecewise linear vector fields on a mesh."""
+def vector_space(domain: Any, degree: int = 1) -> Any:
+    """Continuous piecewise polynomial vector fields on a mesh."""
     with quiet_jit():
-        name = domain.ufl_cell().cellname
-        element = _element(name() if callable(name) else name)
-        make = getattr(fem, "functionspace", None) or fem.FunctionSpace
-        return make(domain, element)
+        return _space(domain, _lagrange(cell_name(domain), degree, domain.geometry.dim))
 
 
-def node_dofs(domain: Any, space: Any) -> NDArray[np.int64]:
-    """For every original node its block number in the space, (n,): unknown 3 * block + axis belongs to it."""
-    geometry = domain.geometry.dofmaps[0] if hasattr(domain.geometry, "dofmaps") else domain.geometry.dofmap
-    geometry = geometry.array if hasattr(geometry, "array") else geometry
-    dofs = space.dofmap.list
-    dofs = dofs.array if hasattr(dofs, "array") else dofs
-    original = np.asarray(domain.geometry.input_global_indices)[np.ravel(geometry)]
-    blocks = np.empty(original.max() + 1, dtype=np.int64)
-    blocks[original] = np.ravel(dofs)
-    return blocks
+def cell_space(domain: Any) -> Any:
+    """Numbers constant on each cell."""
+    with quiet_jit():
+        return _space(domain, _lagrange(cell_name(domain), 0, 1, discontinuous=True))
+
+
+def taylor_hood_space(domain: Any) -> Any:
+    """Quadratic displacement with continuous linear pressure (Taylor and Hood 1973)."""
+    cell = cell_name(domain)
+    with quiet_jit():
+        return _space(domain, _mixed(_lagrange(cell, 2, domain.geometry.dim), _lagrange(cell, 1, 1)))
+
+
+def collapse(space: Any, part: int) -> tuple[Any, NDArray[np.int64]]:
+    """A part of a mixed space on its own, and the number in the whole of each of its unknowns."""
+    with quiet_jit():
+        alone, numbers = space.sub(part).collapse()
+    return alone, np.asarray(numbers, dtype=np.int64)
+
+
+def _table(list_: Any, rows: int) -> NDArray[np.int64]:
+    values = list_.array if hasattr(list_, "array") else list_
+    return np.asarray(values, dtype=np.int64).reshape(rows, -1)
+
+
+def cell_dofs(space: Any) -> NDArray[np.int64]:
+    """Block numbers of each local cell, (cells, k)."""
+    return _table(space.dofmap.list, local_cells(space.mesh))
+
+
+def local_cells(domain: Any) -> int:
+    """How many cells this rank knows, those of its neighbours included."""
+    cells = domain.topology.index_map(domain.topology.dim)
+    return int(cells.size_local + cells.num_ghosts)
+
+
+def original_cells(domain: Any) -> NDArray[np.int64]:
+    """Row of each local cell in the array that the mesh was made from."""
+    return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
+
+
+def cell_vertices(domain: Any) -> NDArray[np.int64]:
+    """Local vertex numbers of each local cell, in DOLFINx's order."""
+    dimension = domain.topology.dim
+    domain.topology.create_connectivity(dimension, 0)
+    return _table(domain.topology.connectivity(dimension, 0).array, local_cells(domain))
+
+
+def exterior_facets(domain: Any) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Local numbers of the boundary's facets, and their vertices, (facets, k)."""
+    dimension = domain.topology.dim - 1
+    domain.topology.create_connectivity(dimension, dimension + 1)
+    domain.topology.create_connectivity(dimension, 0)
+    facets = np.asarray(mesh.exterior_facet_indices(domain.topology), dtype=np.int32)
+    vertices = domain.topology.connectivity(dimension, 0)
+    return facets, np.array([vertices.links(facet) for facet in facets], dtype=np.int64).reshape(len(facets), -1)
+
+
+def facet_measure(domain: Any, facets: NDArray[np.int32], degree: int) -> Any:
+    """The measure ds over given facets of the boundary."""
+    marked = mesh.meshtags(domain, domain.topology.dim - 1, np.sort(facets), np.ones(len(facets), dtype=np.int32))
+    return ufl.Measure("ds", domain=domain, subdomain_data=marked, metadata={"quadrature_degree": degree})(1)
 
 
 def constant(domain: Any, value: float) -> Any:
@@ -162,10 +253,19 @@ def form(expression: Any) -> Any:
         return fem.form(expression, **{name: jit})
 
 
-def dirichlet(space: Any, blocks: NDArray[np.int64]) -> Any:
-    """A zero displacement on the given blocks."""
-    zero = fem.Function(space)
-    return fem.dirichletbc(zero, np.sort(blocks).astype(np.int32))
+def dirichlet(space: Any, domain: Any, unknowns: list[NDArray[np.int64]], mixed: bool) -> list[Any]:
+    """Conditions that hold given unknowns: one for each axis, with their local numbers in the whole space."""
+    zero = constant(domain, 0.0)
+    parts = space.sub(0) if mixed else space
+    return [
+        fem.dirichletbc(zero, np.sort(numbers).astype(np.int32), parts.sub(axis))
+        for axis, numbers in enumerate(unknowns)
+        if _any(domain.comm, len(numbers))
+    ]
+
+
+def _any(comm: Any, count: int) -> bool:
+    return bool(comm.allreduce(count))
 
 
 def create_matrix(compiled: Any) -> Any:
@@ -180,12 +280,41 @@ def assemble_matrix(matrix: Any, compiled: Any, conditions: list[Any]) -> None:
     matrix.assemble()
 
 
-def assemble_vector(vector: Any, compiled: Any) -> None:
-    """Assemble a linear form into a PETSc vector of one process."""
-    vector.zeroEntries()
-    fem_petsc.assemble_vector(vector, compiled)
+def add_facet_matrix(matrix: Any, compiled: list[Any], held: NDArray[np.int32]) -> None:
+    """Add bilinear forms over facets, without the rows and columns of held unknowns (this rank's numbers).
+
+    DOLFINx 0.5.2 puts the zeros of conditions into wrong places of facet matrices: they are made afterwards.
+    """
+    first = matrix.getOwnershipRange()[0]
+    for part in compiled:
+        extra = matrix.duplicate()
+        fem_petsc.assemble_matrix(extra, part, [], 1.0)
+        extra.assemble()
+        extra.zeroRowsColumns(held + first, 0.0)
+        matrix.axpy(1.0, extra, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        extra.destroy()
 
 
-def scalar(compiled: Any) -> float:
-    """The value of a functional on this process."""
-    return float(fem.assemble_scalar(compiled))
+def assemble_vector(vector: Any, compiled: list[Any]) -> None:
+    """Assemble the sum of linear forms into a ghosted vector; afterwards its owned part is whole."""
+    with vector.localForm() as local:
+        local.set(0.0)
+    for part in compiled:
+        fem_petsc.assemble_vector(vector, part)
+    if vector.comm.size > 1:
+        vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+
+
+def ghosted_vector(space: Any) -> Any:
+    """A vector of a space with room for the neighbours' values."""
+    layout, block = space.dofmap.index_map, space.dofmap.index_map_bs
+    owned, total = layout.size_local * block, layout.size_global * block
+    ghosts = np.asarray(layout.ghosts, dtype=np.int64)
+    unrolled = (ghosts[:, None] * block + np.arange(block)).ravel().astype(PETSc.IntType)
+    return PETSc.Vec().createGhost(unrolled, size=(owned, total), comm=space.mesh.comm)
+
+
+def scalar(compiled: Any, comm: Any = MPI.COMM_SELF) -> float:
+    """The value of a functional over all ranks."""
+    here = float(fem.assemble_scalar(compiled))
+    return here if comm.size == 1 else float(comm.allreduce(here))

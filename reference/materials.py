@@ -1,97 +1,314 @@
-"""Strain energies of isotropic soft tissue; stress and tangent are derived from them by UFL."""
+"""Strain energies of isotropic soft tissue; stress and tangent are derived from them by UFL.
+
+Every parameter is a number or an array with one value a cell. A material of one's own is an `Energy`: one function.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, Protocol
 
+import numpy as np
 import ufl
+from numpy.typing import ArrayLike, NDArray
 
-Constant = Callable[[float], Any]
+Floats = NDArray[np.float64]
+Parameter = float | Floats
 
 
 class Material(Protocol):
     """What the reference needs to know of a material."""
 
     @property
-    def young_modulus(self) -> float:
-        """Young's modulus, pascals."""
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Its parameters by name: numbers, or arrays of shape (cells,)."""
 
     @property
-    def poisson_ratio(self) -> float:
-        """Poisson's ratio, in (0, 0.5)."""
+    def is_mixed(self) -> bool:
+        """True when the pressure is an unknown of its own."""
 
-    def energy(self, F: Any, constant: Constant) -> Any:
-        """Strain energy per volume at rest, J/m^3, for a deformation gradient F (UFL).
+    @property
+    def is_linear(self) -> bool:
+        """True when the energy is quadratic in the displacement, so that no cell is ever inside out."""
+
+    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+        """Strain energy per volume at rest, J/m^3 (with its multiplier, where mixed), in UFL.
 
         Args:
-            F: deformation gradient.
-            constant: wraps a number so that another value needs no new compilation.
+            F: deformation gradient, 3 x 3.
+            pressure: unknown pressure, Pa; None where the material is not mixed.
+            p: the parameters as attributes.
         """
 
 
-def _check(name: str, young_modulus: float, poisson_ratio: float) -> None:
-    if not young_modulus > 0.0:
-        raise ValueError(f"{name}.young_modulus: expected a positive number of pascals, got {young_modulus}.")
-    if not 0.0 < poisson_ratio < 0.5:
-        raise ValueError(
-            f"{name}.poisson_ratio: expected a number in (0, 0.5), got {poisson_ratio}; "
-            "nearly incompressible tissue is 0.45 to 0.49."
-        )
+class _Parameters:
+    """A frozen dataclass whose fields are its parameters."""
+
+    is_mixed = False
+    is_linear = False
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Its parameters by name: numbers, or arrays of shape (cells,)."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+
+    def _freeze(self, name: str) -> Floats:
+        """A parameter as a number or a read-only array, and its values for a check."""
+        given = getattr(self, name)
+        values = np.asarray(given, dtype=np.float64)
+        if values.ndim > 1 or values.size == 0:
+            raise ValueError(
+                f"{type(self).__name__}.{name}: expected a number or one value for each cell, shape (cells,), "
+                f"got shape {values.shape}."
+            )
+        if values.ndim == 1:
+            values = values.copy()
+            values.flags.writeable = False
+        object.__setattr__(self, name, values if values.ndim else float(values))
+        return values
+
+    def _positive(self, *names: str, unit: str = "pascals", zero: bool = False) -> None:
+        for name in names:
+            values = self._freeze(name)
+            good = values >= 0.0 if zero else values > 0.0
+            if not good.all():
+                raise ValueError(
+                    f"{type(self).__name__}.{name}: expected {'no negative' if zero else 'a positive'} number of {unit}, "
+                    f"got {_first(values, ~good)}."
+                )
+
+    def _below_half(self, name: str, mixed: str) -> None:
+        values = self._freeze(name)
+        bad = ~((values >= 0.0) & (values < 0.5))
+        if bad.any():
+            worst = _first(values, bad)
+            advice = (
+                f"; incompressible tissue needs the pressure as an unknown: {mixed}"
+                if np.max(values) >= 0.5
+                else "; nearly incompressible tissue is 0.45 to 0.49"
+            )
+            raise ValueError(f"{type(self).__name__}.{name}: expected a number in [0, 0.5), got {worst}{advice}.")
 
 
-def lame(young_modulus: float, poisson_ratio: float) -> tuple[float, float]:
+def _first(values: Floats, bad: NDArray[np.bool_]) -> str:
+    if values.ndim == 0:
+        return str(float(values))
+    cells = np.flatnonzero(bad)
+    return f"{values[cells[0]]} in cell {cells[0]} ({len(cells)} of {len(values)} cells)"
+
+
+def lame(young_modulus: Any, poisson_ratio: Any) -> tuple[Any, Any]:
     """Lamé parameters (mu, lambda), pascals."""
     mu = young_modulus / (2.0 * (1.0 + poisson_ratio))
     return mu, young_modulus * poisson_ratio / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
 
 
-@dataclass(frozen=True)
-class NeoHookean:
-    """Compressible Neo-Hookean: psi = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 (Odot 2023, eq. 2.27).
-
-    Args:
-        young_modulus: Young's modulus, pascals.
-        poisson_ratio: Poisson's ratio, in (0, 0.5).
-    """
-
-    young_modulus: float
-    poisson_ratio: float
-
-    def __post_init__(self) -> None:
-        _check("NeoHookean", self.young_modulus, self.poisson_ratio)
-
-    def energy(self, F: Any, constant: Constant) -> Any:
-        """Strain energy per volume at rest, J/m^3."""
-        mu, lmbda = map(constant, lame(self.young_modulus, self.poisson_ratio))
-        ln_J = ufl.ln(ufl.det(F))
-        return mu / 2 * (ufl.inner(F, F) - 3) - mu * ln_J + lmbda / 2 * ln_J**2
+def bulk(young_modulus: Any, poisson_ratio: Any) -> Any:
+    """Bulk modulus E / (3 (1 - 2 nu)), pascals."""
+    return young_modulus / (3.0 * (1.0 - 2.0 * poisson_ratio))
 
 
-@dataclass(frozen=True)
-class SaintVenantKirchhoff:
-    """Saint-Venant-Kirchhoff: psi = lambda/2 (tr E)^2 + mu E : E with the Green-Lagrange strain E.
+@dataclass(frozen=True, eq=False)
+class _Elastic(_Parameters):
+    """Two constants: Young's modulus, pascals, and Poisson's ratio, in [0, 0.5)."""
 
-    Args:
-        young_modulus: Young's modulus, pascals.
-        poisson_ratio: Poisson's ratio, in (0, 0.5).
-    """
-
-    young_modulus: float
-    poisson_ratio: float
+    young_modulus: Parameter
+    poisson_ratio: Parameter
 
     def __post_init__(self) -> None:
-        _check("SaintVenantKirchhoff", self.young_modulus, self.poisson_ratio)
+        self._positive("young_modulus")
+        self._below_half("poisson_ratio", mixed="IncompressibleNeoHookean")
 
-    def energy(self, F: Any, constant: Constant) -> Any:
+
+class LinearElastic(_Elastic):
+    """Linear elasticity: psi = lambda/2 (tr e)^2 + mu e : e with the small strain e (Odot 2023, eq. 2.14)."""
+
+    is_linear = True
+
+    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
         """Strain energy per volume at rest, J/m^3."""
-        mu, lmbda = map(constant, lame(self.young_modulus, self.poisson_ratio))
+        mu, lmbda = lame(p.young_modulus, p.poisson_ratio)
+        e = ufl.sym(F) - ufl.Identity(3)
+        return lmbda / 2 * ufl.tr(e) ** 2 + mu * ufl.inner(e, e)
+
+
+class SaintVenantKirchhoff(_Elastic):
+    """Saint-Venant-Kirchhoff: psi = lambda/2 (tr E)^2 + mu E : E with the Green-Lagrange strain E (Odot 2023, 2.4)."""
+
+    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+        """Strain energy per volume at rest, J/m^3."""
+        mu, lmbda = lame(p.young_modulus, p.poisson_ratio)
         E = (F.T * F - ufl.Identity(3)) / 2
         return lmbda / 2 * ufl.tr(E) ** 2 + mu * ufl.inner(E, E)
 
 
-MATERIALS: dict[str, type[NeoHookean] | type[SaintVenantKirchhoff]] = {
-    "neo-hookean": NeoHookean,
+class NeoHookean(_Elastic):
+    """Compressible Neo-Hookean: psi = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 (Odot 2023, 2.4)."""
+
+    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+        """Strain energy per volume at rest, J/m^3."""
+        mu, lmbda = lame(p.young_modulus, p.poisson_ratio)
+        ln_J = ufl.ln(ufl.det(F))
+        return mu / 2 * (ufl.inner(F, F) - 3) - mu * ln_J + lmbda / 2 * ln_J**2
+
+
+def _isochoric_invariants(F: Any) -> tuple[Any, Any, Any]:
+    """J_1 and J_2 of C / J^(2/3) (Odot 2023, eq. 2.23), and J."""
+    C, J = F.T * F, ufl.det(F)
+    I1 = ufl.tr(C)
+    return J ** (-2 / 3) * I1, J ** (-4 / 3) * (I1**2 - ufl.inner(C, C)) / 2, J
+
+
+class IsochoricNeoHookean(_Elastic):
+    """Neo-Hookean with the isochoric-volumetric split: psi = mu/2 (J_1 - 3) + k/2 (J - 1)^2 (Odot 2023, eq. 2.27)."""
+
+    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+        """Strain energy per volume at rest, J/m^3."""
+        mu, _ = lame(p.young_modulus, p.poisson_ratio)
+        J_1, _, J = _isochoric_invariants(F)
+        return mu / 2 * (J_1 - 3) + bulk(p.young_modulus, p.poisson_ratio) / 2 * (J - 1) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class MooneyRivlin(_Parameters):
+    """Mooney-Rivlin with the split: psi = c1 (J_1 - 3) + c2 (J_2 - 3) + k/2 (J - 1)^2 (Odot 2023, eq. 2.24).
+
+    Args:
+        c1: first constant, pascals; 2 (c1 + c2) is the shear modulus at rest.
+        c2: second constant, pascals; 0 gives Neo-Hookean.
+        bulk_modulus: k, pascals.
+    """
+
+    c1: Parameter
+    c2: Parameter
+    bulk_modulus: Parameter
+
+    def __post_init__(self) -> None:
+        self._positive("c1", "bulk_modulus")
+        self._positive("c2", zero=True)
+        if not np.isfinite(self.bulk_modulus).all():
+            raise ValueError(
+                "MooneyRivlin.bulk_modulus: expected a finite number of pascals, got infinity; "
+                "incompressible tissue needs the pressure as an unknown: IncompressibleMooneyRivlin."
+            )
+
+    @classmethod
+    def from_elastic(cls, young_modulus: Parameter, poisson_ratio: Parameter, share: float = 0.5) -> MooneyRivlin:
+        """The constants that agree with Young's modulus and Poisson's ratio for small strains.
+
+        Args:
+            young_modulus: pascals.
+            poisson_ratio: in [0, 0.5).
+            share: c1 / (c1 + c2).
+        """
+        checked = IsochoricNeoHookean(young_modulus, poisson_ratio)
+        half = lame(checked.young_modulus, checked.poisson_ratio)[0] / 2
+        return cls(share * half, (1 - share) * half, bulk(checked.young_modulus, checked.poisson_ratio))
+
+    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+        """Strain energy per volume at rest, J/m^3."""
+        J_1, J_2, J = _isochoric_invariants(F)
+        return p.c1 * (J_1 - 3) + p.c2 * (J_2 - 3) + p.bulk_modulus / 2 * (J - 1) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class IncompressibleMooneyRivlin(_Parameters):
+    """Mooney-Rivlin with the pressure as an unknown: psi = c1 (J_1 - 3) + c2 (J_2 - 3) - p (J - 1) - c p^2 / 2.
+
+    p is positive in compression (Odot 2023, eq. 2.23-2.26). Without compressibility J = 1; otherwise eliminating
+    p = -k (J - 1) gives `MooneyRivlin` with k = 1 / c, without its locking.
+
+    Args:
+        c1: first constant, pascals.
+        c2: second constant, pascals.
+        compressibility: c = 1 / k, 1/pascals; 0 is fully incompressible.
+    """
+
+    c1: Parameter
+    c2: Parameter
+    compressibility: Parameter = 0.0
+    is_mixed = True
+
+    def __post_init__(self) -> None:
+        self._positive("c1")
+        self._positive("c2", zero=True)
+        self._positive("compressibility", unit="1/pascals", zero=True)
+
+    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+        """Strain energy per volume at rest with its multiplier, J/m^3."""
+        J_1, J_2, J = _isochoric_invariants(F)
+        constraint = pressure * (J - 1) + p.compressibility / 2 * pressure**2
+        return p.c1 * (J_1 - 3) + p.c2 * (J_2 - 3) - constraint
+
+
+@dataclass(frozen=True, eq=False)
+class IncompressibleNeoHookean(_Parameters):
+    """Neo-Hookean with the pressure as an unknown: psi = mu/2 (J_1 - 3) - p (J - 1) - c p^2 / 2 (Odot 2023, eq. 2.27).
+
+    Args:
+        shear_modulus: mu, pascals; a third of Young's modulus.
+        compressibility: c = 1 / k, 1/pascals; 0 is fully incompressible.
+    """
+
+    shear_modulus: Parameter
+    compressibility: Parameter = 0.0
+    is_mixed = True
+
+    def __post_init__(self) -> None:
+        self._positive("shear_modulus")
+        self._positive("compressibility", unit="1/pascals", zero=True)
+
+    @classmethod
+    def from_elastic(cls, young_modulus: Parameter, poisson_ratio: Parameter = 0.5) -> IncompressibleNeoHookean:
+        """The constants that agree with Young's modulus and Poisson's ratio (0.5 allowed) for small strains."""
+        mu = np.asarray(young_modulus) / (2 * (1 + np.asarray(poisson_ratio)))
+        return cls(mu, 3 * (1 - 2 * np.asarray(poisson_ratio)) / np.asarray(young_modulus))
+
+    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+        """Strain energy per volume at rest with its multiplier, J/m^3."""
+        J_1, _, J = _isochoric_invariants(F)
+        return p.shear_modulus / 2 * (J_1 - 3) - pressure * (J - 1) - p.compressibility / 2 * pressure**2
+
+
+@dataclass(frozen=True, eq=False)
+class Energy:
+    """A strain energy of one's own.
+
+    `Energy(lambda F, mu: mu / 2 * (ufl.inner(F, F) - 3 - 2 * ufl.ln(ufl.det(F))), {"mu": 1000.0})`
+
+    Args:
+        function: from the deformation gradient (UFL, 3 x 3) and the parameters (by name) to J/m^3.
+        parameters: numbers, or arrays of shape (cells,), by name.
+        is_linear: the energy is quadratic in the displacement.
+    """
+
+    function: Callable[..., Any]
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+    is_linear: bool = False
+    is_mixed = False
+
+    def __post_init__(self) -> None:
+        checked = {}
+        for name, given in self.parameters.items():
+            values = np.asarray(given, dtype=np.float64)
+            if values.ndim > 1 or not np.isfinite(values).all():
+                raise ValueError(
+                    f"Energy.parameters[{name!r}]: expected a finite number or one for each cell, got {given!r}."
+                )
+            checked[name] = values if values.ndim else float(values)
+        object.__setattr__(self, "parameters", MappingProxyType(checked))
+
+    def energy(self, F: Any, pressure: Any, p: SimpleNamespace) -> Any:
+        """Strain energy per volume at rest, J/m^3."""
+        return self.function(F, **vars(p))
+
+
+# Materials that Young's modulus and Poisson's ratio define, by the name they have in configuration files.
+MATERIALS: dict[str, type[_Elastic]] = {
+    "linear-elastic": LinearElastic,
     "saint-venant-kirchhoff": SaintVenantKirchhoff,
+    "neo-hookean": NeoHookean,
+    "isochoric-neo-hookean": IsochoricNeoHookean,
 }

@@ -15,7 +15,7 @@ from softtwin.reference.outcome import NotConverged
 E, NU = 5000.0, 0.45
 
 
-@pytest.fixture(params=sorted(MATERIALS))
+@pytest.fixture(params=["neo-hookean", "saint-venant-kirchhoff"])
 def problem(request: pytest.FixtureRequest, any_beam: Body):
     with Problem(any_beam, MATERIALS[request.param](E, NU)) as made:
         yield made

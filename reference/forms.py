@@ -1,0 +1,286 @@
+"""Energy, residual and tangent of a body, and the loads on it: UFL forms, compiled once and assembled many times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .discretisation import Discretisation, quadrature_degree
+from .fenicsx import (
+    add_facet_matrix,
+    assemble_matrix,
+    assemble_vector,
+    constant,
+    create_matrix,
+    fem,
+    form,
+    ghosted_vector,
+    scalar,
+    ufl,
+)
+from .loading import Loading
+from .materials import Material, Parameter
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Load:
+    """A load as unknowns.
+
+    Args:
+        dead: forces that do not change, this rank's unknowns, newtons.
+        lift: prescribed displacements at held unknowns, zero elsewhere, metres.
+        pressure: pascals of each surface.
+    """
+
+    dead: Floats
+    lift: Floats
+    pressure: dict[str, float]
+
+    def scaled(self, factor: float) -> Load:
+        """The same load, `factor` times as strong."""
+        return Load(factor * self.dead, factor * self.lift, {name: factor * p for name, p in self.pressure.items()})
+
+
+class Forms:
+    """What is assembled for one body of one material.
+
+    Args:
+        space: the body's discretisation.
+        material: strain energy.
+        weights: factor of each cell's energy, (cells,), the part of the cell that is filled; None for 1.
+        degree: of the quadrature; None for the least that is safe.
+    """
+
+    def __init__(
+        self, space: Discretisation, material: Material, weights: Floats | None = None, degree: int | None = None
+    ) -> None:
+        self.space, self.material = space, material
+        self.degree = degree or quadrature_degree(space.body, material.is_mixed)
+        self.dx = space.measure(self.degree)
+        self.parameters = {name: self.parameter(name, value) for name, value in material.parameters.items()}
+        self.weights = 1 if weights is None else space.cell_function(weights, "Problem.weights")
+        self._vector = ghosted_vector(space.space)
+        self._surfaces: dict[str, _SurfaceForms] = {}
+        self.direction = fem.Function(space.space)
+        self._compile()
+
+    def parameter(self, name: str, value: Parameter) -> Any:
+        """A parameter as forms read it: a number that another may replace without compiling, or one for each cell."""
+        if np.ndim(value) == 0:
+            return constant(self.space.mesh, float(value))
+        return self.space.cell_function(value, f"{type(self.material).__name__}.{name}")
+
+    def split(self, function: Any) -> tuple[Any, Any]:
+        """Displacement and pressure (None where there is none) of a function of the whole space."""
+        return ufl.split(function) if self.space.mixed else (function, None)
+
+    def energy_density(self, u: Any, pressure: Any, parameters: dict[str, Any], gradient: Any = None) -> Any:
+        """Strain energy per volume of the cell at rest (UFL)."""
+        F = self.space.deformation_gradient(u) if gradient is None else gradient
+        return self.weights * self.material.energy(F, pressure, SimpleNamespace(**parameters))
+
+    def _compile(self) -> None:
+        u, pressure = self.split(self.space.state)
+        psi = self.energy_density(u, pressure, self.parameters)
+        guarded = psi
+        if not self.material.is_linear:
+            # The vanishing term turns the energy into NaN where the body is turned inside out, for every material.
+            F = self.space.deformation_gradient(u)
+            guarded = psi + constant(self.space.mesh, 0.0) * ufl.ln(ufl.det(F))
+        residual = ufl.derivative(psi * self.dx, self.space.state, ufl.TestFunction(self.space.space))
+        tangent = ufl.derivative(residual, self.space.state, ufl.TrialFunction(self.space.space))
+        self._energy = form(guarded * self.dx)
+        self._residual = form(residual)
+        self._tangent = form(tangent)
+        self._tangent_action: Any = None
+        self._tangent_expression = tangent
+
+    # ------------------------------------------------------------------ loads
+
+    def load(self, loading: Loading) -> Load:
+        """A load as unknowns."""
+        space = self.space
+        dead, lift = np.zeros(space.owned), np.zeros(space.owned)
+        if loading.forces is not None:
+            dead += space.unknowns("Problem.forces", loading.forces)
+        if loading.body_force is not None:
+            dead += self.assembled(self._body_force(np.asarray(loading.body_force)))
+        for surface, traction in loading.traction.items():
+            forms = self.surface(surface)
+            forms.traction.value[:] = traction
+            dead += self.assembled(forms.traction_form)
+        dead[space.fixed] = 0.0
+        field = np.zeros_like(space.body.points)
+        for name, values in loading.displacement.items():
+            field[space.body.node_sets[name]] = values
+        everywhere = space.unknowns("Loading.displacement", field)
+        lift[space.fixed] = everywhere[space.fixed]
+        return Load(dead, lift, {name: value for name, value in loading.pressure.items() if value != 0.0})
+
+    def _body_force(self, force: Floats) -> Any:
+        v, _ = self._test()
+        return form(self.weights * ufl.inner(fem.Constant(self.space.mesh, force), v) * self.dx)
+
+    def _test(self) -> tuple[Any, Any]:
+        return ufl.TestFunctions(self.space.space) if self.space.mixed else (ufl.TestFunction(self.space.space), None)
+
+    def surface(self, name: str) -> _SurfaceForms:
+        """The forms of a named surface, compiled when it is first loaded."""
+        if name not in self._surfaces:
+            self._surfaces[name] = _SurfaceForms(self, name)
+        return self._surfaces[name]
+
+    # ------------------------------------------------------------------ assembly at a state
+
+    def assembled(self, *compiled: Any) -> Floats:
+        """The sum of linear forms at the present state, this rank's unknowns."""
+        assemble_vector(self._vector, list(compiled))
+        return np.array(self._vector.array_r)
+
+    def _pressed(self, load: Load) -> list[_SurfaceForms]:
+        pressed = []
+        for name, pascals in load.pressure.items():
+            forms = self.surface(name)
+            forms.pressure.value = pascals
+            pressed.append(forms)
+        return pressed
+
+    def residual(self, unknowns: Floats, load: Load) -> Floats:
+        """Out-of-balance forces; at held unknowns their distance from where they should be."""
+        self.space.set_state(unknowns)
+        out = self.assembled(self._residual, *(s.pressure_form for s in self._pressed(load))) - load.dead
+        fixed = self.space.fixed
+        out[fixed] = unknowns[fixed] - load.lift[fixed]
+        return out
+
+    def internal(self, unknowns: Floats) -> Floats:
+        """Derivative of the strain energy, held unknowns included."""
+        self.space.set_state(unknowns)
+        return self.assembled(self._residual)
+
+    def tangent(self, unknowns: Floats, load: Load, matrix: Any) -> None:
+        """The derivative of the residual into a matrix; held rows and columns are the identity's."""
+        self.space.set_state(unknowns)
+        assemble_matrix(matrix, self._tangent, self.space.conditions)
+        add_facet_matrix(matrix, [s.pressure_tangent for s in self._pressed(load)], self.space.fixed)
+
+    def tangent_times(self, unknowns: Floats, direction: Floats) -> Floats:
+        """The stiffness of the strain energy times a direction, held unknowns included."""
+        if self._tangent_action is None:
+            self._tangent_action = form(ufl.action(self._tangent_expression, self.direction))
+        self.space.set_state(unknowns)
+        self.space.set_function(self.direction, direction)
+        return self.assembled(self._tangent_action)
+
+    def energy(self, unknowns: Floats) -> float:
+        """Strain energy, joules; NaN where a cell is inside out."""
+        self.space.set_state(unknowns)
+        return scalar(self._energy, self.space.comm)
+
+    def potential(self, unknowns: Floats, load: Load) -> float:
+        """Strain energy minus the work of dead forces, joules."""
+        return self.energy(unknowns) - self.space.dot(load.dead, unknowns)
+
+    def pressed(self, unknowns: Floats, load: Load) -> Floats:
+        """What following pressures add to the residual."""
+        surfaces = self._pressed(load)
+        if not surfaces:
+            return np.zeros(self.space.owned)
+        self.space.set_state(unknowns)
+        return self.assembled(*(s.pressure_form for s in surfaces))
+
+    def pressure_potential(self, unknowns: Floats, load: Load) -> float:
+        """Pressure times the volume between a surface, before and after, and the origin, joules."""
+        total = 0.0
+        for surface in self._pressed(load):
+            for state, sign in ((unknowns, 1.0), (np.zeros_like(unknowns), -1.0)):
+                self.space.set_state(state)
+                total += sign * scalar(surface.volume_form, self.space.comm)
+        return total
+
+    def pressure_work(self, start: Floats, step: Floats, load: Load) -> float:
+        """Work of the following pressure along the straight way from `start` to `start + step`, joules.
+
+        Simpson's rule is exact: the deformed area is quadratic in the displacement.
+        """
+        pressed = self._pressed(load)
+        if not pressed:
+            return 0.0
+        work = 0.0
+        for share, at in ((1, 0.0), (4, 0.5), (1, 1.0)):
+            self.space.set_state(start + at * step)
+            work -= share / 6 * self.space.dot(self.assembled(*(s.pressure_form for s in pressed)), step)
+        return work
+
+    def is_conservative(self, load: Load) -> bool:
+        """True when the tangent of the following pressures is symmetric: their surfaces are closed or held all round."""
+        pressed = self._pressed(load)
+        if not pressed:
+            return True
+        rng = np.random.default_rng(0)
+        matrix = create_matrix(self._tangent)
+        self.space.set_state(1e-2 * self.space.body.size * rng.standard_normal(self.space.owned))
+        matrix.assemble()
+        add_facet_matrix(matrix, [s.pressure_tangent for s in pressed], self.space.fixed)
+        x, y, out = matrix.createVecRight(), matrix.createVecRight(), matrix.createVecLeft()
+        for vector in (x, y):
+            vector.array[:] = rng.standard_normal(self.space.owned)
+            vector.array[self.space.fixed] = 0.0
+        matrix.mult(x, out)
+        one, scale = out.dot(y), out.norm() * y.norm()
+        matrix.mult(y, out)
+        other = out.dot(x)
+        for item in (matrix, x, y, out):
+            item.destroy()
+        return bool(abs(one - other) <= 1e-10 * scale)
+
+    def create_matrix(self) -> Any:
+        """A matrix with the tangent's sparsity."""
+        return create_matrix(self._tangent)
+
+    def stiffness_scale(self) -> float:
+        """The modulus that resists stretching at rest, pascals: v K(0) v / volume for the field v = (x, 0, 0)."""
+        points = self.space.body.points
+        stretch = np.zeros_like(points)
+        stretch[:, 0] = points[:, 0] - points[:, 0].mean()
+        v = self.space.unknowns("stretch", stretch)
+        product = self.tangent_times(np.zeros(self.space.owned), v)
+        return abs(self.space.dot(product, v)) / self.space.body.volume
+
+    def close(self) -> None:
+        """Free the PETSc objects."""
+        self._vector.destroy()
+
+
+class _SurfaceForms:
+    """Traction and following pressure on one named surface."""
+
+    def __init__(self, forms: Forms, name: str) -> None:
+        space = forms.space
+        ds = space.facet_measure(name, max(forms.degree, 2 * space.body.kind.degree))
+        test, _ = forms._test()
+        self.traction = fem.Constant(space.mesh, np.zeros(space.body.dimension))
+        self.pressure = constant(space.mesh, 0.0)
+        self.ds = ds
+        self.traction_form = form(ufl.inner(self.traction, test) * ds)
+        u, _ = forms.split(space.state)
+        pressed = self.pressure * ufl.inner(deformed_area(space, u), test) * ds
+        self.pressure_form = form(pressed)
+        x = ufl.SpatialCoordinate(space.mesh) + u
+        self.volume_form = form(self.pressure / space.body.dimension * ufl.inner(deformed_area(space, u), x) * ds)
+        self.pressure_tangent = form(ufl.derivative(pressed, space.state, ufl.TrialFunction(space.space)))
+
+
+def deformed_area(space: Discretisation, u: Any, gradient: Any = None) -> Any:
+    """Area vector after the deformation per area at rest, cof(F) N (Nanson; Odot 2023, eq. 2.11), in UFL."""
+    F = space.deformation_gradient(u) if gradient is None else gradient
+    cofactor = ufl.det(F) * ufl.inv(F).T
+    N = ufl.FacetNormal(space.mesh)
+    dimension = space.body.dimension
+    return ufl.as_vector([sum(cofactor[i, j] * N[j] for j in range(dimension)) for i in range(dimension)])

@@ -1,0 +1,277 @@
+"""Newton's method on the energy: PETSc SNES, with a search that shortens or turns the step before SNES takes it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .fenicsx import PETSc
+from .forms import Forms, Load
+from .linear import METHODS, LinearSolver, Method, chosen_method
+from .outcome import Iteration
+
+Floats = NDArray[np.float64]
+Search = Literal["energy", "full", "bt", "l2", "cp"]
+_SEARCHES = ("energy", "full", "bt", "l2", "cp")
+
+_ARMIJO = 1e-4
+_SMALLEST_STEP = 1e-8
+_ROUND_OFF = 1e-12  # of the energy: differences below it say nothing about descent
+_CHORD_RATE = 0.1  # a factorisation is kept while it divides the residual by ten an iteration
+_prefixes = itertools.count()
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """How far, how long and in which way to iterate.
+
+    Args:
+        tolerance: norm of the residual over free unknowns, relative to the norm of the forces.
+        max_iterations: Newton iterations of one load step.
+        max_load_steps: load steps tried, failed ones included, before giving up.
+        search: `energy`, Armijo's rule on the energy, which converges where the others do not; `full` steps, halved
+            only where a cell would be inside out; PETSc's `bt`, `l2`, `cp` on the residual. A mixed problem has no
+            energy to decrease and takes `full` steps for `energy`.
+        first_step: part of the load that is tried first; 1 tries the whole load at once, and steps only if that fails.
+        chord: keep a factorisation while it converges fast; False factors in each iteration.
+        linear: `direct` (MUMPS), `multigrid` (conjugate gradients with smoothed aggregation), `auto` by size.
+    """
+
+    tolerance: float = 1e-8
+    max_iterations: int = 60
+    max_load_steps: int = 100
+    search: Search = "energy"
+    first_step: float = 1.0
+    chord: bool = True
+    linear: Method = "auto"
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.tolerance < 1.0:
+            raise ValueError(f"NewtonOptions.tolerance: expected a number in (0, 1), got {self.tolerance}.")
+        if not 0.0 < self.first_step <= 1.0:
+            raise ValueError(f"NewtonOptions.first_step: expected a number in (0, 1], got {self.first_step}.")
+        for name in ("max_iterations", "max_load_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"NewtonOptions.{name}: expected at least 1, got {getattr(self, name)}.")
+        for name, allowed in (("search", _SEARCHES), ("linear", METHODS)):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"NewtonOptions.{name}: expected one of {allowed}, got {getattr(self, name)!r}.")
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One run of SNES: the unknowns it stopped at and how it ended."""
+
+    unknowns: Floats
+    converged: bool
+    reason: int
+    iterations: int
+    residual: float
+
+    @property
+    def reason_name(self) -> str:
+        """Why SNES stopped, in its words."""
+        names = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
+        return names.get(self.reason, str(self.reason)).lower()
+
+
+class Newton:
+    """SNES for one body: its tangent, its factorisation and what happened in the present solve.
+
+    Args:
+        forms: energy, residual and tangent.
+        options: tolerance, limits, search, linear algebra.
+    """
+
+    def __init__(self, forms: Forms, options: NewtonOptions) -> None:
+        self.forms, self.space, self.options = forms, forms.space, options
+        self.search: Search = options.search
+        if forms.space.mixed and options.search == "energy":
+            self.search = "full"
+        self.matrix = forms.create_matrix()
+        self._residual, self._x = self.matrix.createVecLeft(), self.matrix.createVecRight()
+        self._snes: Any = None
+        self.factored_at: tuple[Floats, dict[str, float]] | None = None
+        self._round_off = 8.0 * np.finfo(float).eps * forms.stiffness_scale() * _face(forms.space.body)
+        self._make_solver(symmetric=True)
+        self.start_count()
+
+    def _make_solver(self, symmetric: bool) -> None:
+        if self._snes is not None:
+            self.linear.close()
+            self._snes.destroy()
+        snes = PETSc.SNES().create(self.space.comm)
+        snes.setOptionsPrefix(f"softtwin_{next(_prefixes)}_")
+        snes.setType("newtonls")
+        snes.setFunction(self._function, self._residual)
+        snes.setJacobian(self._jacobian, self.matrix)
+        snes.setLineSearchPreCheck(self._precheck)
+        snes.setConvergenceTest(self._test)
+        method = chosen_method(self.options.linear, self.space)
+        self.linear = LinearSolver(self.matrix, self.space, method, snes.getKSP(), symmetric)
+        _set_line_search(snes, self.search if self.search in ("bt", "l2", "cp") else "basic")
+        self._snes, self.symmetric = snes, symmetric
+        self.factored_at = None
+
+    def suit(self, load: Load) -> None:
+        """Change to L U where a following pressure makes the tangent unsymmetric, and back."""
+        symmetric = self.forms.is_conservative(load)
+        if symmetric != self.symmetric:
+            self._make_solver(symmetric)
+
+    def start_count(self) -> None:
+        """Forget the counts and the trace of the last solve."""
+        self.factorisations = 0
+        self.trace: list[Iteration] = []
+
+    def run(self, load: Load, start: Floats, factor: float = 1.0) -> Attempt:
+        """Iterate from a start whose held unknowns are where they should be.
+
+        Args:
+            load: the load.
+            start: unknowns to start from.
+            factor: part of the full load that this is, for the trace.
+        """
+        self._load, self._factor = load, factor
+        self._norms: list[float] = []
+        self._search_failed = False
+        self._length = 1.0
+        self._reached: float | None = None  # potential where the last step led
+        self._start_tolerance(load)
+        self._x.array[:] = start
+        self.linear.loosen()
+        with _interrupts():
+            self._snes.solve(None, self._x)
+        reason, iterations = int(self._snes.getConvergedReason()), self._snes.getIterationNumber()
+        return Attempt(np.array(self._x.array_r), reason > 0, reason, iterations, float(self._norms[-1]))
+
+    def _start_tolerance(self, load: Load) -> None:
+        scale = self.space.norm(load.dead)
+        if load.pressure or self.space.dot(load.lift, load.lift) > 0.0:
+            # Reactions and pressures are forces too: what holds the start's strains and surfaces in place.
+            lifted = self.forms.tangent_times(np.zeros(self.space.owned), load.lift)
+            pressed = self.forms.residual(np.zeros(self.space.owned), load)
+            pressed[self.space.fixed] = 0.0
+            scale = max(scale, self.space.norm(lifted), self.space.norm(pressed))
+        self._absolute_tolerance = max(self.options.tolerance * scale, self._round_off)
+
+    # ------------------------------------------------------------------ the four things SNES asks for
+
+    def _function(self, snes: Any, x: Any, f: Any) -> None:
+        values = self.forms.residual(np.array(x.array_r), self._load)
+        if self.search != "energy" and not np.isfinite(self.forms.energy(np.array(x.array_r))):
+            values[:] = np.nan  # PETSc's searches shorten a step that leads there
+        f.array[:] = values
+
+    def _jacobian(self, snes: Any, x: Any, tangent: Any, preconditioner: Any) -> None:
+        if not self._keeps_factorisation():
+            self.assemble(np.array(x.array_r), self._load)
+
+    def _keeps_factorisation(self) -> bool:
+        """Near the solution the last factorisation still converges: a chord step costs a tenth of a Newton step."""
+        if not self.options.chord or self.factored_at is None or len(self._norms) < 3:
+            return False
+        return self._norms[-1] < _CHORD_RATE * self._norms[-2]
+
+    def assemble(self, unknowns: Floats, load: Load) -> None:
+        """The tangent at a state, unless it is there already."""
+        at = self.factored_at
+        here = at is not None and at[1] == load.pressure and np.array_equal(at[0], unknowns)
+        if self.space.comm.size > 1:
+            here = bool(self.space.comm.allreduce(int(here)) == self.space.comm.size)
+        if here:
+            return
+        self.factored_at = None
+        self.forms.tangent(unknowns, load, self.matrix)
+        self.factored_at = (unknowns.copy(), dict(load.pressure))
+        self.factorisations += 1
+
+    def _test(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
+        reasons = PETSc.SNES.ConvergedReason
+        norm = norms[2]
+        self._norms.append(norm)
+        self.trace.append(Iteration(self._factor, iteration, norm, self._reached, self._length, self.factorisations))
+        if not np.isfinite(norm):
+            return reasons.DIVERGED_FNORM_NAN
+        if norm <= self._absolute_tolerance:
+            return reasons.CONVERGED_FNORM_ABS
+        if self._search_failed:
+            return reasons.DIVERGED_LINE_SEARCH
+        return reasons.DIVERGED_MAX_IT if iteration >= self.options.max_iterations else reasons.ITERATING
+
+    def _precheck(self, x: Any, y: Any) -> bool:
+        """Shorten (or turn) the Newton direction; SNES then takes x - y whole, or its own search goes on from there."""
+        if self.search in ("bt", "l2", "cp"):
+            return False
+        unknowns, step = np.array(x.array_r), np.array(y.array_r)
+        if self.search == "full":
+            self._length = self._admissible(unknowns, step)
+        else:
+            slope = -self.space.dot(np.asarray(self._residual.array_r), step)  # SNES left the residual at x in there
+            if slope > 0.0:  # an indefinite tangent may point uphill
+                step, slope = -step, -slope
+            self._length = self._search(unknowns, step, slope)
+        self._search_failed = self._length == 0.0
+        y.array[:] = self._length * step
+        return True
+
+    def _admissible(self, unknowns: Floats, step: Floats) -> float:
+        length = 1.0
+        while length > _SMALLEST_STEP:
+            if np.isfinite(self.forms.energy(unknowns - length * step)):
+                return length
+            length /= 2.0
+        return 0.0
+
+    def _search(self, unknowns: Floats, step: Floats, slope: float) -> float:
+        """Armijo's rule on the energy with quadratic interpolation; a step that turns a cell inside out is refused."""
+        forms, load = self.forms, self._load
+        start = forms.potential(unknowns, load) if self._reached is None else self._reached
+        noise = _ROUND_OFF * (abs(start) + abs(self.space.dot(load.dead, unknowns)))
+        length = 1.0
+        while length > _SMALLEST_STEP:
+            reached = forms.potential(unknowns - length * step, load)
+            change = reached - start - forms.pressure_work(unknowns, -length * step, load)
+            if change <= _ARMIJO * length * slope + noise:
+                self._reached = reached
+                return length
+            best = -slope * length / (2.0 * (change / length - slope)) if np.isfinite(change) else 0.5 * length
+            length = float(np.clip(best, 0.1 * length, 0.5 * length))
+        return 0.0
+
+    def close(self) -> None:
+        """Free the PETSc objects."""
+        self.linear.close()
+        for item in (self._snes, self.matrix, self._residual, self._x):
+            item.destroy()
+
+
+def _face(body: Any) -> float:
+    """An area that stresses act on: size squared in space, size in the plane."""
+    return float(body.size ** (body.dimension - 1))
+
+
+def _set_line_search(snes: Any, name: str) -> None:
+    options = PETSc.Options()
+    key = snes.getOptionsPrefix() + "snes_linesearch_type"
+    options[key] = name
+    snes.setFromOptions()
+    options.delValue(key)
+
+
+@contextmanager
+def _interrupts() -> Iterator[None]:
+    """Let an exception raised inside a PETSc callback (Ctrl-C above all) leave as itself."""
+    try:
+        yield
+    except PETSc.Error as error:
+        cause = error.__cause__ or error.__context__
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause from None
+        raise
