@@ -87,9 +87,7 @@ class Problem:
         """Free the PETSc objects; the problem cannot be used after."""
         self._newton.close()
         for solver in (self._rest, self._poisson):
-            if solver is not None:
-                solver.close()
-                solver.matrix.destroy()
+            _free(solver)
         self._forms.close()
 
     def __enter__(self) -> Problem:
@@ -99,6 +97,21 @@ class Problem:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def set_material(self, material: Material) -> None:
+        """Other parameters of the same law; nothing is compiled again.
+
+        Args:
+            material: of the class, and with the shapes of parameters, that the problem was built with.
+
+        Raises:
+            ValueError: another law or other shapes.
+        """
+        self._forms.set_material(material)
+        self.material = material
+        self._newton.forget()
+        _free(self._rest)
+        self._rest = None
 
     @property
     def size(self) -> int:
@@ -381,6 +394,12 @@ class Problem:
         if isinstance(state, Equilibrium):
             return self._space.unknowns(f"Problem.{name}", state.displacement, state.pressure)
         return self._space.unknowns(f"Problem.{name}", state)
+
+
+def _free(solver: LinearSolver | None) -> None:
+    if solver is not None:
+        solver.close()
+        solver.matrix.destroy()
 
 
 def _checked_weights(weights: ArrayLike, cells: int) -> Floats:

@@ -39,7 +39,7 @@ from softtwin.meshes.elements import Kind
 __all__ = [
     "MPI",
     "PETSc",
-    "add_facet_matrix",
+    "add_matrix",
     "assemble_matrix",
     "assemble_vector",
     "cell_dofs",
@@ -52,6 +52,7 @@ __all__ = [
     "dirichlet",
     "dolfinx",
     "exterior_facets",
+    "facet_matrix",
     "facet_measure",
     "fem",
     "form",
@@ -249,7 +250,9 @@ def form(expression: Any) -> Any:
     cache = _cache_directory()
     jit = {"cffi_extra_compile_args": _COMPILE, "cache_dir": cache, "timeout": _COMPILE_TIMEOUT_S}
     name = "jit_options" if "jit_options" in inspect.signature(fem.form).parameters else "jit_params"
-    with quiet_jit(), _compiling(cache):
+    # Ranks that share a mesh compile together: only the first may hold the lock, or the others would wait for it.
+    alone = expression.ufl_domains()[0].ufl_cargo().comm.rank == 0
+    with quiet_jit(), _compiling(cache) if alone else contextlib.nullcontext():
         return fem.form(expression, **{name: jit})
 
 
@@ -280,19 +283,22 @@ def assemble_matrix(matrix: Any, compiled: Any, conditions: list[Any]) -> None:
     matrix.assemble()
 
 
-def add_facet_matrix(matrix: Any, compiled: list[Any], held: NDArray[np.int32]) -> None:
-    """Add bilinear forms over facets, without the rows and columns of held unknowns (this rank's numbers).
+def facet_matrix(compiled: Any, held: NDArray[np.int32]) -> Any:
+    """A matrix of a bilinear form over facets, without the rows and columns of held unknowns (this rank's numbers).
 
     DOLFINx 0.5.2 puts the zeros of conditions into wrong places of facet matrices: they are made afterwards.
     """
-    first = matrix.getOwnershipRange()[0]
-    for part in compiled:
-        extra = matrix.duplicate()
-        fem_petsc.assemble_matrix(extra, part, [], 1.0)
-        extra.assemble()
-        extra.zeroRowsColumns(held + first, 0.0)
-        matrix.axpy(1.0, extra, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        extra.destroy()
+    matrix = create_matrix(compiled)
+    fem_petsc.assemble_matrix(matrix, compiled, [], 1.0)
+    matrix.assemble()
+    matrix.zeroRowsColumns(held + matrix.getOwnershipRange()[0], 0.0)
+    return matrix
+
+
+def add_matrix(matrix: Any, part: Any) -> None:
+    """Add a matrix whose entries are among the other's, and free it."""
+    matrix.axpy(1.0, part, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+    part.destroy()
 
 
 def assemble_vector(vector: Any, compiled: list[Any]) -> None:

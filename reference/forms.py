@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from .discretisation import Discretisation, quadrature_degree
 from .fenicsx import (
-    add_facet_matrix,
+    add_matrix,
     assemble_matrix,
     assemble_vector,
     constant,
     create_matrix,
+    facet_matrix,
     fem,
     form,
     ghosted_vector,
@@ -68,6 +69,7 @@ class Forms:
         self._vector = ghosted_vector(space.space)
         self._surfaces: dict[str, _SurfaceForms] = {}
         self.direction = fem.Function(space.space)
+        self.derivatives: Any = None  # what sensitivity.py compiles, kept here from equilibrium to equilibrium
         self._compile()
 
     def parameter(self, name: str, value: Parameter) -> Any:
@@ -75,6 +77,24 @@ class Forms:
         if np.ndim(value) == 0:
             return constant(self.space.mesh, float(value))
         return self.space.cell_function(value, f"{type(self.material).__name__}.{name}")
+
+    def set_material(self, material: Material) -> None:
+        """Other parameters of the same law, without compiling again.
+
+        Raises:
+            ValueError: another law, or a number where there was one for each cell, or the reverse.
+        """
+        if type(material) is not type(self.material) or set(material.parameters) != set(self.parameters):
+            raise ValueError(f"material: expected another {type(self.material).__name__}, got {material!r}.")
+        for name, value in material.parameters.items():
+            if np.ndim(value) != np.ndim(self.material.parameters[name]):
+                raise ValueError(f"material.{name}: expected the shape that the problem was built with, got {value!r}.")
+        for name, value in material.parameters.items():
+            if np.ndim(value) == 0:
+                self.parameters[name].value = float(value)
+            else:
+                self.parameters[name].x.array[:] = self.space.cell_function(value, f"material.{name}").x.array
+        self.material = material
 
     def split(self, function: Any) -> tuple[Any, Any]:
         """Displacement and pressure (None where there is none) of a function of the whole space."""
@@ -168,7 +188,8 @@ class Forms:
         """The derivative of the residual into a matrix; held rows and columns are the identity's."""
         self.space.set_state(unknowns)
         assemble_matrix(matrix, self._tangent, self.space.conditions)
-        add_facet_matrix(matrix, [s.pressure_tangent for s in self._pressed(load)], self.space.fixed)
+        for surface in self._pressed(load):
+            add_matrix(matrix, facet_matrix(surface.pressure_tangent, self.space.fixed))
 
     def tangent_times(self, unknowns: Floats, direction: Floats) -> Floats:
         """The stiffness of the strain energy times a direction, held unknowns included."""
@@ -224,21 +245,21 @@ class Forms:
         if not pressed:
             return True
         rng = np.random.default_rng(0)
-        matrix = create_matrix(self._tangent)
         self.space.set_state(1e-2 * self.space.body.size * rng.standard_normal(self.space.owned))
-        matrix.assemble()
-        add_facet_matrix(matrix, [s.pressure_tangent for s in pressed], self.space.fixed)
-        x, y, out = matrix.createVecRight(), matrix.createVecRight(), matrix.createVecLeft()
-        for vector in (x, y):
-            vector.array[:] = rng.standard_normal(self.space.owned)
-            vector.array[self.space.fixed] = 0.0
-        matrix.mult(x, out)
-        one, scale = out.dot(y), out.norm() * y.norm()
-        matrix.mult(y, out)
-        other = out.dot(x)
-        for item in (matrix, x, y, out):
-            item.destroy()
-        return bool(abs(one - other) <= 1e-10 * scale)
+        x, y = rng.standard_normal((2, self.space.owned))
+        products = []
+        for surface in pressed:
+            matrix = facet_matrix(surface.pressure_tangent, self.space.fixed)
+            a, b, out = matrix.createVecRight(), matrix.createVecRight(), matrix.createVecLeft()
+            a.array[:], b.array[:] = x, y
+            matrix.mult(a, out)
+            products.append((out.dot(b), out.norm() * b.norm()))
+            matrix.mult(b, out)
+            products[-1] = (products[-1][0] - out.dot(a), products[-1][1])
+            for item in (matrix, a, b, out):
+                item.destroy()
+        gap, scale = np.sum(products, axis=0)
+        return bool(abs(gap) <= 1e-10 * scale)
 
     def create_matrix(self) -> Any:
         """A matrix with the tangent's sparsity."""

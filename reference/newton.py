@@ -98,8 +98,8 @@ class Newton:
         self._residual, self._x = self.matrix.createVecLeft(), self.matrix.createVecRight()
         self._snes: Any = None
         self.factored_at: tuple[Floats, dict[str, float]] | None = None
-        self._round_off = 8.0 * np.finfo(float).eps * forms.stiffness_scale() * _face(forms.space.body)
         self._make_solver(symmetric=True)
+        self.forget()
         self.start_count()
 
     def _make_solver(self, symmetric: bool) -> None:
@@ -124,6 +124,11 @@ class Newton:
         symmetric = self.forms.is_conservative(load)
         if symmetric != self.symmetric:
             self._make_solver(symmetric)
+
+    def forget(self) -> None:
+        """The material has changed: the factorisation is none of it any more."""
+        self.factored_at = None
+        self._round_off = 8.0 * np.finfo(float).eps * self.forms.stiffness_scale() * _face(self.space.body)
 
     def start_count(self) -> None:
         """Forget the counts and the trace of the last solve."""
