@@ -199,7 +199,10 @@ class Body:
         width = len(self.kind.pieces[0])
         wanted = _rows(self.surfaces[surface])
         inside = np.isin(_rows(self.boundary), wanted).reshape(len(self.facets), -1)
-        if inside.any(axis=1).sum() * inside.shape[1] != len(np.unique(wanted)) or (inside.any(axis=1) != inside.all(axis=1)).any():
+        if (
+            inside.any(axis=1).sum() * inside.shape[1] != len(np.unique(wanted))
+            or (inside.any(axis=1) != inside.all(axis=1)).any()
+        ):
             raise BodyError(
                 f"Body.surfaces[{surface!r}]: expected whole facets of the boundary "
                 f"({inside.shape[1]} pieces of {width} nodes each), got {len(wanted)} pieces that do not make them up."
@@ -260,7 +263,9 @@ class Body:
         width = self.facets.shape[1]
         outer = by_corners[np.isin(_rows(by_corners[:, :width]), _rows(self.facets))]
         groups = [(outer, width), (cells, kind.corners)]
-        sets = {name: np.unique(np.concatenate([s, *(_whole(*g, s) for g in groups)])) for name, s in self.node_sets.items()}
+        sets = {
+            name: np.unique(np.concatenate([s, *(_whole(*g, s) for g in groups)])) for name, s in self.node_sets.items()
+        }
         surfaces = {}
         for name in self.surfaces:
             chosen = np.isin(_rows(outer[:, :width]), _rows(self.facets_of(name)))

@@ -16,6 +16,7 @@ class Kind:
 
     Args:
         name: its name in meshio.
+        vtk: its number in VTK.
         shape: `triangle`, `quadrilateral`, `tetrahedron` or `hexahedron`.
         dimension: of the space it fills.
         degree: of its shape functions.
@@ -27,6 +28,7 @@ class Kind:
     """
 
     name: str
+    vtk: int
     shape: str
     dimension: int
     degree: int
@@ -63,9 +65,12 @@ def _with_middles(
     return tuple(whole)
 
 
-def _quadratic(name: str, linear: Kind, parents: tuple[tuple[int, ...], ...], pieces: tuple[tuple[int, ...], ...]) -> Kind:
+def _quadratic(
+    name: str, vtk: int, linear: Kind, parents: tuple[tuple[int, ...], ...], pieces: tuple[tuple[int, ...], ...]
+) -> Kind:
     return Kind(
         name,
+        vtk,
         linear.shape,
         linear.dimension,
         2,
@@ -77,10 +82,10 @@ def _quadratic(name: str, linear: Kind, parents: tuple[tuple[int, ...], ...], pi
     )
 
 
-_TRIANGLE = Kind("triangle", "triangle", 2, 1, 3, 3, ((0, 1), (1, 2), (2, 0)), ((0, 1),))
-_QUADRILATERAL = Kind("quad", "quadrilateral", 2, 1, 4, 4, ((0, 1), (1, 2), (2, 3), (3, 0)), ((0, 1),))
-_TETRAHEDRON = Kind("tetra", "tetrahedron", 3, 1, 4, 4, _TETRAHEDRON_FACES, ((0, 1, 2),))
-_HEXAHEDRON = Kind("hexahedron", "hexahedron", 3, 1, 8, 8, _HEXAHEDRON_FACES, ((0, 1, 2), (0, 2, 3)))
+_TRIANGLE = Kind("triangle", 5, "triangle", 2, 1, 3, 3, ((0, 1), (1, 2), (2, 0)), ((0, 1),))
+_QUADRILATERAL = Kind("quad", 9, "quadrilateral", 2, 1, 4, 4, ((0, 1), (1, 2), (2, 3), (3, 0)), ((0, 1),))
+_TETRAHEDRON = Kind("tetra", 10, "tetrahedron", 3, 1, 4, 4, _TETRAHEDRON_FACES, ((0, 1, 2),))
+_HEXAHEDRON = Kind("hexahedron", 12, "hexahedron", 3, 1, 8, 8, _HEXAHEDRON_FACES, ((0, 1, 2), (0, 2, 3)))
 _SPLIT_EDGE = ((0, 2), (2, 1))
 _SPLIT_TRIANGLE = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
 _SPLIT_QUADRILATERAL = (
@@ -89,11 +94,12 @@ _SPLIT_QUADRILATERAL = (
 )
 _LINEAR = (_TRIANGLE, _QUADRILATERAL, _TETRAHEDRON, _HEXAHEDRON)
 _QUADRATIC = (
-    _quadratic("triangle6", _TRIANGLE, ((0, 1), (1, 2), (2, 0)), _SPLIT_EDGE),
-    _quadratic("quad9", _QUADRILATERAL, ((0, 1), (1, 2), (2, 3), (3, 0), (0, 1, 2, 3)), _SPLIT_EDGE),
-    _quadratic("tetra10", _TETRAHEDRON, _TETRAHEDRON_EDGES, _SPLIT_TRIANGLE),
+    _quadratic("triangle6", 22, _TRIANGLE, ((0, 1), (1, 2), (2, 0)), _SPLIT_EDGE),
+    _quadratic("quad9", 28, _QUADRILATERAL, ((0, 1), (1, 2), (2, 3), (3, 0), (0, 1, 2, 3)), _SPLIT_EDGE),
+    _quadratic("tetra10", 24, _TETRAHEDRON, _TETRAHEDRON_EDGES, _SPLIT_TRIANGLE),
     _quadratic(
         "hexahedron27",
+        29,
         _HEXAHEDRON,
         (*_HEXAHEDRON_EDGES, *_HEXAHEDRON_CENTRES, (0, 1, 2, 3, 4, 5, 6, 7)),
         _SPLIT_QUADRILATERAL,

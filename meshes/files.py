@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkPoints, vtkStringOutputWindow
-from vtkmodules.vtkCommonDataModel import VTK_HEXAHEDRON, VTK_TETRA, vtkCellArray, vtkUnstructuredGrid
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
 from vtkmodules.vtkFiltersCore import vtkTriangleFilter
 from vtkmodules.vtkIOLegacy import vtkDataSetReader
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader, vtkXMLUnstructuredGridWriter
 
 from .body import Body, Floats, Ints, Surface, corner_jacobians
+from .elements import KINDS
 
 Unit = Literal["m", "cm", "mm"]
 Axes = Literal["lps", "ras"]
@@ -34,10 +35,11 @@ _LARGEST, _SMALLEST = 2.0, 5e-3  # metres: an organ outside these was read in th
 _MESHIO = (".stl", ".ply", ".obj", ".msh")
 _VTK: Mapping[str, Any] = {".vtk": vtkDataSetReader, ".vtu": vtkXMLUnstructuredGridReader, ".vtp": vtkXMLPolyDataReader}
 _TEXT = (".txt", ".csv", ".xyz")
-_VTK_CORNERS = {5: ("triangle", 3), 9: ("quad", 4), 10: ("tetra", 4), 12: ("hexahedron", 8)}
+_VTK_NODES = {kind.vtk: (kind.name, kind.nodes) for kind in KINDS.values()}
 _MARK = "softtwin body"
 _PLAIN = " :()[]/,=+@"
 _PREFIXES = ("node_set:", "surface:", "inner_points:", "inner_triangles:")
+_FIELD = "field:"
 
 
 class FileError(ValueError):
@@ -130,7 +132,7 @@ def read_cloud(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Floats
     return _in_metres(path, points, unit, axes, smallest=0.0)
 
 
-def write_body(path: str | Path, body: Body) -> None:
+def write_body(path: str | Path, body: Body, fields: Mapping[str, ArrayLike] | None = None) -> None:
     """Write a body to a VTU file that `read_body` reads back bit for bit, and that ParaView shows.
 
     The file appears whole or not at all.
@@ -138,11 +140,16 @@ def write_body(path: str | Path, body: Body) -> None:
     Args:
         path: file to write, `.vtu`.
         body: the body.
+        fields: arrays that go with it, by name (eigenmodes for instance); those with a row for each node can be seen
+            in ParaView.
 
     Raises:
         FileError: another suffix, or the file could not be written.
     """
     grid = _grid(body.points, body.cells)
+    for name, field in (fields or {}).items():
+        array = np.asarray(field)
+        _add(grid.GetPointData() if len(array) == len(body.points) else grid.GetFieldData(), f"{_FIELD}{name}", array)
     for name, nodes in body.node_sets.items():
         mask = np.zeros(len(body.points), dtype=np.uint8)
         mask[nodes] = 1
@@ -177,9 +184,27 @@ def read_body(path: str | Path) -> Body:
         raise FileError(f"{path}: not a body written by softtwin; read it as a mesh and say which nodes are fixed.")
     sets, surfaces, points, triangles = (_named(arrays, prefix) for prefix in _PREFIXES)
     blocks = _grid_blocks(grid)
-    cells = blocks["tetra"] if "tetra" in blocks else blocks["hexahedron"]
     inner = {name: Surface(points[name], triangles[name]) for name in points}
-    return Body(vtk_to_numpy(grid.GetPoints().GetData()), cells, sets, surfaces, inner)
+    kind = next(kind for kind in KINDS.values() if kind.name in blocks)
+    positions = vtk_to_numpy(grid.GetPoints().GetData())[:, : kind.dimension]
+    return Body(positions, blocks[kind.name], sets, surfaces, inner)
+
+
+def read_fields(path: str | Path) -> dict[str, NDArray[Any]]:
+    """The arrays that `write_body` wrote with a body, by name.
+
+    Args:
+        path: VTU file.
+
+    Raises:
+        FileError: missing or damaged file.
+    """
+    grid = _read_vtk(_existing(path))
+    found: dict[str, NDArray[Any]] = {}
+    for data in (grid.GetFieldData(), grid.GetPointData()):
+        arrays = {data.GetArrayName(i): data.GetArray(i) for i in range(data.GetNumberOfArrays())}
+        found |= _named(arrays, _FIELD)
+    return found
 
 
 def write_deformed(
@@ -201,6 +226,8 @@ def write_deformed(
     if moved.shape != body.points.shape:
         raise ValueError(f"displacement: expected shape {body.points.shape}, got {moved.shape}.")
     grid = _grid(body.points + moved, body.cells)
+    if body.dimension == 2:
+        moved = np.column_stack([moved, np.zeros(len(moved))])
     _add(grid.GetPointData(), "displacement", moved)
     for name, field in (fields or {}).items():
         array = np.asarray(field)
@@ -325,7 +352,7 @@ def _grid_blocks(grid: Any) -> dict[str, Ints]:
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     blocks = {}
     for kind in np.unique(types):
-        name, corners = _VTK_CORNERS.get(int(kind), (f"VTK type {kind}", 1))
+        name, corners = _VTK_NODES.get(int(kind), (f"VTK type {kind}", 1))
         blocks[name] = connectivity[starts[types == kind][:, None] + np.arange(corners)]
     return blocks
 
@@ -410,11 +437,14 @@ def _warn_size(path: Path, size: float, unit: Unit, smallest: float) -> None:
 
 def _grid(points: Floats, cells: Ints) -> vtkUnstructuredGrid:
     grid, nodes, array = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
+    kind = KINDS[points.shape[1], cells.shape[1]]
+    if points.shape[1] == 2:
+        points = np.column_stack([points, np.zeros(len(points))])
     nodes.SetData(numpy_to_vtk(points, deep=True))
     offsets = np.arange(0, cells.size + 1, cells.shape[1])
     array.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(cells.ravel(), deep=True))
     grid.SetPoints(nodes)
-    grid.SetCells(VTK_TETRA if cells.shape[1] == 4 else VTK_HEXAHEDRON, array)
+    grid.SetCells(kind.vtk, array)
     return grid
 
 

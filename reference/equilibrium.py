@@ -118,6 +118,11 @@ class Problem:
         """How many unknowns there are, held ones and pressures included."""
         return int(self._space.size)
 
+    @property
+    def held_axes(self) -> NDArray[np.bool_]:
+        """Which components of which nodes are held, (n, 3)."""
+        return self._space.held
+
     # ------------------------------------------------------------------ equilibria
 
     def solve(
@@ -317,8 +322,12 @@ class Problem:
         return self._space.field(self._forms.internal(self._unknowns(displacement)))
 
     def external_forces(self, load: Loading | ArrayLike, displacement: ArrayLike | None = None) -> Floats:
-        """Nodal forces equivalent to a load on free axes, (n, 3), newtons; a following pressure acts on the shape that
-        a displacement gives (rest if not given)."""
+        """Nodal forces equivalent to a load on free axes, (n, 3), newtons.
+
+        Args:
+            load: the load.
+            displacement: gives the shape that a following pressure acts on, (n, 3), metres; rest if not given.
+        """
         wanted = self._load(load)
         unknowns = self._unknowns(displacement)
         pressed = self._forms.pressed(unknowns, wanted)
@@ -378,7 +387,7 @@ class Problem:
         return np.array([self._space.field(row).ravel() for row in solved]).T.reshape(right.shape)
 
     def negative_pivots(self, displacement: ArrayLike | Equilibrium | None = None) -> int | None:
-        """Negative pivots of the tangent at a state: 0 where it is stable; None where nothing is factored (multigrid)."""
+        """Negative pivots of the tangent at a state: 0 is stable, None where nothing is factored (multigrid)."""
         return self._negative_pivots(self._unknowns(displacement), self._unloaded)
 
     def _negative_pivots(self, unknowns: Floats, load: Load) -> int | None:

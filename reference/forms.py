@@ -240,7 +240,7 @@ class Forms:
         return work
 
     def is_conservative(self, load: Load) -> bool:
-        """True when the tangent of the following pressures is symmetric: their surfaces are closed or held all round."""
+        """True when the tangent of following pressures is symmetric: their surfaces are closed or held all round."""
         pressed = self._pressed(load)
         if not pressed:
             return True

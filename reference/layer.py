@@ -52,7 +52,9 @@ class EquilibriumLayer:
 
     def _parameters(self, given: tuple[Any, ...], named: dict[str, Any]) -> list[torch.Tensor]:
         if len(given) > len(self.names) or not set(named) <= set(self.names[len(given) :]):
-            raise TypeError(f"EquilibriumLayer: expected the parameters {self.names}, got {len(given)} and {sorted(named)}.")
+            raise TypeError(
+                f"EquilibriumLayer: expected the parameters {self.names}, got {len(given)} and {sorted(named)}."
+            )
         chosen = {**self.problem.material.parameters, **dict(zip(self.names, given, strict=False)), **named}
         return [torch.as_tensor(chosen[name], dtype=torch.float64) for name in self.names]
 

@@ -95,7 +95,7 @@ class LinearSolver:
 
     def _set_near_nullspace(self) -> None:
         space = self._space
-        vectors = []
+        vectors: list[Floats] = []
         for motion in rigid_motions(space.body.points):
             values = space.unknowns("motion", motion)
             values[space.fixed] = 0.0
@@ -146,8 +146,8 @@ class LinearSolver:
             (self.ksp.solveTranspose if transpose and not self.symmetric else self.ksp.solve)(b, x)
             if self.ksp.getConvergedReason() < 0:
                 raise RuntimeError(
-                    f"LinearSolver.solve: {self.method} did not converge in {self.ksp.getIterationNumber()} iterations; "
-                    "NewtonOptions(linear='direct') may."
+                    f"LinearSolver.solve: {self.method} did not converge in {self.ksp.getIterationNumber()} "
+                    "iterations; NewtonOptions(linear='direct') may."
                 )
             out[i] = x.array_r
         b.destroy()

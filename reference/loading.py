@@ -80,7 +80,8 @@ def checked_loading(load: Loading | ArrayLike, body: Body, held: Mapping[str, st
     for name in given.displacement:
         if name not in held:
             raise ValueError(
-                f"Loading.displacement: expected a node set that the problem holds, one of {sorted(held)}, got {name!r}."
+                f"Loading.displacement: expected a node set that the problem holds, one of {sorted(held)}, "
+                f"got {name!r}."
             )
     return Loading(
         None if given.forces is None else checked_array("Problem.forces", given.forces, (count, dimension)),

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import ufl
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Parameter = float | Floats
@@ -75,8 +75,8 @@ class _Parameters:
             good = values >= 0.0 if zero else values > 0.0
             if not good.all():
                 raise ValueError(
-                    f"{type(self).__name__}.{name}: expected {'no negative' if zero else 'a positive'} number of {unit}, "
-                    f"got {_first(values, ~good)}."
+                    f"{type(self).__name__}.{name}: expected a {'number >= 0' if zero else 'positive number'} of "
+                    f"{unit}, got {_first(values, ~good)}."
                 )
 
     def _below_half(self, name: str, mixed: str) -> None:
@@ -120,6 +120,10 @@ class _Elastic(_Parameters):
     def __post_init__(self) -> None:
         self._positive("young_modulus")
         self._below_half("poisson_ratio", mixed="IncompressibleNeoHookean")
+
+    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+        """Strain energy per volume at rest, J/m^3."""
+        raise NotImplementedError
 
 
 class LinearElastic(_Elastic):

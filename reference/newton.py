@@ -23,7 +23,8 @@ _SEARCHES = ("energy", "full", "bt", "l2", "cp")
 _ARMIJO = 1e-4
 _SMALLEST_STEP = 1e-8
 _ROUND_OFF = 1e-12  # of the energy: differences below it say nothing about descent
-_CHORD_RATE = 0.1  # a factorisation is kept while it divides the residual by ten an iteration
+_EPSILONS = 8.0  # of machine precision in sums of stresses and energies that cancel
+_CHORD_STEPS = 8  # with a kept factorisation cost as much as a new one and its iteration
 _prefixes = itertools.count()
 
 
@@ -97,6 +98,7 @@ class Newton:
         self.matrix = forms.create_matrix()
         self._residual, self._x = self.matrix.createVecLeft(), self.matrix.createVecRight()
         self._snes: Any = None
+        self.linear: LinearSolver
         self.factored_at: tuple[Floats, dict[str, float]] | None = None
         self._make_solver(symmetric=True)
         self.forget()
@@ -128,7 +130,9 @@ class Newton:
     def forget(self) -> None:
         """The material has changed: the factorisation is none of it any more."""
         self.factored_at = None
-        self._round_off = 8.0 * np.finfo(float).eps * self.forms.stiffness_scale() * _face(self.space.body)
+        body = self.space.body
+        noise = float(_EPSILONS * np.finfo(float).eps * self.forms.stiffness_scale())
+        self._round_off, self._energy_noise = noise * _face(body), noise * body.volume
 
     def start_count(self) -> None:
         """Forget the counts and the trace of the last solve."""
@@ -164,7 +168,7 @@ class Newton:
             pressed = self.forms.residual(np.zeros(self.space.owned), load)
             pressed[self.space.fixed] = 0.0
             scale = max(scale, self.space.norm(lifted), self.space.norm(pressed))
-        self._absolute_tolerance = max(self.options.tolerance * scale, self._round_off)
+        self._absolute_tolerance = max(float(self.options.tolerance * scale), self._round_off)
 
     # ------------------------------------------------------------------ the four things SNES asks for
 
@@ -179,10 +183,11 @@ class Newton:
             self.assemble(np.array(x.array_r), self._load)
 
     def _keeps_factorisation(self) -> bool:
-        """Near the solution the last factorisation still converges: a chord step costs a tenth of a Newton step."""
-        if not self.options.chord or self.factored_at is None or len(self._norms) < 3:
+        """Whether the last factorisation, at the rate of the last iteration, is soon enough at the tolerance."""
+        if not self.options.chord or self.factored_at is None or len(self._norms) < 2:
             return False
-        return self._norms[-1] < _CHORD_RATE * self._norms[-2]
+        rate = self._norms[-1] / self._norms[-2]
+        return rate < 1.0 and self._absolute_tolerance >= rate**_CHORD_STEPS * self._norms[-1]
 
     def assemble(self, unknowns: Floats, load: Load) -> None:
         """The tangent at a state, unless it is there already."""
@@ -221,7 +226,7 @@ class Newton:
             slope = -self.space.dot(np.asarray(self._residual.array_r), step)  # SNES left the residual at x in there
             if slope > 0.0:  # an indefinite tangent may point uphill
                 step, slope = -step, -slope
-            self._length = self._search(unknowns, step, slope)
+            self._length = self._armijo(unknowns, step, slope)
         self._search_failed = self._length == 0.0
         y.array[:] = self._length * step
         return True
@@ -234,16 +239,16 @@ class Newton:
             length /= 2.0
         return 0.0
 
-    def _search(self, unknowns: Floats, step: Floats, slope: float) -> float:
+    def _armijo(self, unknowns: Floats, step: Floats, slope: float) -> float:
         """Armijo's rule on the energy with quadratic interpolation; a step that turns a cell inside out is refused."""
         forms, load = self.forms, self._load
-        start = forms.potential(unknowns, load) if self._reached is None else self._reached
-        noise = _ROUND_OFF * (abs(start) + abs(self.space.dot(load.dead, unknowns)))
+        start: float = forms.potential(unknowns, load) if self._reached is None else self._reached
+        noise = self._energy_noise + _ROUND_OFF * (abs(start) + abs(self.space.dot(load.dead, unknowns)))
         length = 1.0
         while length > _SMALLEST_STEP:
             reached = forms.potential(unknowns - length * step, load)
             change = reached - start - forms.pressure_work(unknowns, -length * step, load)
-            if change <= _ARMIJO * length * slope + noise:
+            if change <= float(_ARMIJO * length * slope) + noise:
                 self._reached = reached
                 return length
             best = -slope * length / (2.0 * (change / length - slope)) if np.isfinite(change) else 0.5 * length

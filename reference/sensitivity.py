@@ -267,8 +267,11 @@ class _Derivatives:
     def of_parameters(self, state: Floats, a: Floats) -> dict[str, Floats]:
         """-(dR/dm)^T a for each parameter, (cells,)."""
         self._set(state, a)
-        return {name: -self._by_cells(("L m", name), lambda f: ufl.derivative(self._lagrangian, f, _cell_test(f)), name)
-                for name in self._fields}  # fmt: skip
+
+        def by_field(f: Any) -> Any:
+            return ufl.derivative(self._lagrangian, f, _cell_test(f))
+
+        return {name: -self._by_cells(("L m", name), by_field, name) for name in self._fields}
 
     def _by_cells(self, key: Any, expression: Any, name: str) -> Floats:
         field_ = self._fields[name]
@@ -330,17 +333,13 @@ class _Derivatives:
             traction[name] = np.array([scalar(part, comm) for part in parts])
         for name in loading.pressure:
             ds = self.forms.surface(name).ds
-            part = self._form(
-                ("p", name), lambda ds=ds: ufl.inner(deformed_area(self.space, u), adjoint) * ds
-            )
+            part = self._form(("p", name), lambda ds=ds: ufl.inner(deformed_area(self.space, u), adjoint) * ds)
             pressure[name] = -scalar(part, comm)
         return body_force, traction, pressure
 
     # ------------------------------------------------------------------ second order
 
-    def curvature(
-        self, state: Floats, a: Floats, rate: Floats, directions: Mapping[str, Floats], load: Load
-    ) -> Floats:
+    def curvature(self, state: Floats, a: Floats, rate: Floats, directions: Mapping[str, Floats], load: Load) -> Floats:
         """The derivative of K^T a along a change of state and parameters."""
         self._set(state, a, rate)
         names = self._set_directions(directions)
@@ -430,7 +429,8 @@ class _Derivatives:
         found: list[tuple[Any, Any, Any, Any]] = []
         if loading.body_force is not None:
             force = self._constant("body force")
-            found.append((("X b",), -forms.weights * ufl.inner(force, a) * ufl.det(G) * forms.dx, force, loading.body_force))  # fmt: skip
+            pulled = -forms.weights * ufl.inner(force, a) * ufl.det(G) * forms.dx
+            found.append(("X b", pulled, force, loading.body_force))
         for name, traction in loading.traction.items():
             surface = forms.surface(name)
             area = deformed_area(space, u, G)

@@ -267,7 +267,7 @@ def test_the_linear_response_of_low_rank_is_close_to_the_whole(monkeypatch) -> N
     [
         ({"material": "rubber"}, r"Plan\.material: expected one of .* got 'rubber'"),
         ({"young_modulus": -1.0}, r"young_modulus: expected a positive"),
-        ({"poisson_ratio": 0.5}, r"poisson_ratio: expected a number in \(0, 0.5\)"),
+        ({"poisson_ratio": 0.5}, r"poisson_ratio: expected a number in \[0, 0.5\)"),
         ({"samples": {"train": 3}}, r"Plan\.samples: expected at least one draw"),
         ({"block": 0}, r"Plan\.block: expected at least 1"),
     ],

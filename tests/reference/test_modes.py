@@ -9,10 +9,12 @@ from scipy.linalg import eigh
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.files import FileError, read_body, write_body
+from softtwin.meshes.shapes import beam
 from softtwin.reference.equilibrium import Problem
 from softtwin.reference.loads import LoadPlan, draw_load, loaded_nodes
 from softtwin.reference.materials import NeoHookean
-from softtwin.reference.modes import eigenmodes
+from softtwin.reference.modes import eigenmodes, load_modes, save_modes
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +80,45 @@ def test_zones_confine_the_loads(modal, rng) -> None:
 def test_unknown_zones_are_named(hexahedral_beam: Body) -> None:
     with pytest.raises(ValueError, match=r"LoadPlan\.zones: expected names among .*'tip'.* got \['nowhere'\]"):
         loaded_nodes(hexahedral_beam, LoadPlan(zones=("nowhere",)))
+
+
+def test_modes_weighted_by_mass_agree_with_lapack(modal) -> None:
+    problem, _ = modal
+    modes = eigenmodes(problem, 8, "mass", density=1050.0)
+    free = (3 * problem.body.free[:, None] + np.arange(3)).ravel()
+    K, M = (matrix.toarray()[np.ix_(free, free)] for matrix in (problem.stiffness(), problem.mass(1050.0)))
+    assert problem.mass(1050.0).sum() == pytest.approx(3 * 1050.0 * problem.body.volume)
+    np.testing.assert_allclose(modes.eigenvalues, eigh(K, M, eigvals_only=True)[:8], rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["tetrahedron", "hexahedron"])
+def test_quadratic_cells_have_softer_modes_and_none_spurious(kind: str) -> None:
+    linear = beam((4, 2, 2), (0.6, 0.2, 0.2), kind)
+    values = []
+    for body in (linear, linear.quadratic()):
+        with Problem(body, NeoHookean(5000.0, 0.3)) as problem:
+            modes = eigenmodes(problem, 5, "mass")
+            values.append(modes.eigenvalues)
+            assert np.abs(modes.shapes[:, body.fixed]).max() == 0.0
+    assert (values[1] < values[0]).all() and values[1][0] > 0.1 * values[0][0]
+
+
+def test_modes_are_saved_with_their_body(modal, tmp_path) -> None:
+    problem, modes = modal
+    save_modes(tmp_path / "body.vtu", problem.body, modes)
+    again = load_modes(tmp_path / "body.vtu")
+    np.testing.assert_array_equal(again.eigenvalues, modes.eigenvalues)
+    np.testing.assert_array_equal(again.shapes, modes.shapes)
+    assert read_body(tmp_path / "body.vtu").fingerprint == problem.body.fingerprint
+    write_body(tmp_path / "bare.vtu", problem.body)
+    with pytest.raises(FileError, match="expected a body with eigenmodes"):
+        load_modes(tmp_path / "bare.vtu")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [({"weighting": "volume"}, "eigenmodes.weighting"), ({"density": -1.0}, "eigenmodes.density")],
+)
+def test_weightings_that_cannot_be_are_refused(modal, arguments, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        eigenmodes(modal[0], 3, **arguments)
