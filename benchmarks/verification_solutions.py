@@ -133,19 +133,19 @@ def simple_shear(material: Material, kind: str, shear: float = SHEAR) -> Row:
 # ---------------------------------------------------------------------- torsion
 
 
-def twisted(body: Body, material: Material, angle: float, radius_rotation: str = "finite") -> tuple[float, float]:
+def twisted(body: Body, material: Material, angle: float, is_finite: bool = True) -> tuple[float, float]:
     """Torque and axial force that twist a cylinder's far end by an angle per length, its length kept."""
     end = body.node_sets["z1"]
     x, y, z = body.points[end].T
     turn = angle * z
-    if radius_rotation == "finite":
+    if is_finite:
         u = np.stack([x * np.cos(turn) - y * np.sin(turn) - x, x * np.sin(turn) + y * np.cos(turn) - y, 0 * z], -1)
     else:
         u = np.stack([-turn * y, turn * x, 0 * z], -1)
     with Problem(body, material, TIGHT, held={"z0": "xyz", "z1": "xyz"}) as problem:
         state = problem.solve(Loading(displacement={"z1": u}), stability=False)
         forces = problem.internal_forces(state)[end]
-    arm = body.points[end] + (u if radius_rotation == "finite" else 0.0)
+    arm = body.points[end] + (u if is_finite else 0.0)
     return float((arm[:, 0] * forces[:, 1] - arm[:, 1] * forces[:, 0]).sum()), float(forces[:, 2].sum())
 
 
@@ -176,7 +176,7 @@ def small_torsion(material: Material, twists: Sequence[float] = (0.2, 0.1, 0.05)
     """
     body = _corners_only(cylinder(2, 1.0, 1.0))
     linear = LinearElastic(1.0, 0.3)
-    stiffness = twisted(body, linear, 1.0, "small")[0]
+    stiffness = twisted(body, linear, 1.0, is_finite=False)[0]
     gaps = [abs(twisted(body, material, t)[0] / (stiffness * t) - 1) for t in twists]
     return {"twists": list(twists), "gaps": gaps, "orders": orders(twists, gaps)}
 
@@ -336,7 +336,9 @@ def _patch_row(body: Body, state: Any, u: Floats, forces: Floats, outer: Any) ->
 def patch_with_traction(material: Material, kind: str, pressure: float = 0.3) -> Row:
     """A uniform deformation of an incompressible body, held at all sides but one, where the exact traction acts."""
     body = box(kind, 2, shaken)
-    walls = np.unique(np.concatenate([nodes for name, nodes in body.node_sets.items() if name[0] in "xyz" and name != "x1"]))
+    walls = np.unique(
+        np.concatenate([nodes for name, nodes in body.node_sets.items() if name[0] in "xyz" and name != "x1"])
+    )
     body = body.with_sets(walls=walls)
     F = _patch_gradient(body.dimension, isochoric=True)
     u = body.points @ (F - np.eye(body.dimension)).T
@@ -416,7 +418,7 @@ def exact_stress(material: Material, field: Any, X: NDArray[Any]) -> NDArray[Any
 
 
 def body_force(material: Material, field: Any, X: Floats) -> Floats:
-    """b = -Div P, exact to round-off: each column is differentiated by a complex step (Squire and Trapp 1998)."""
+    """The body force -Div P, exact to round-off: columns by complex steps (Squire and Trapp 1998)."""
     step = 1e-30
     total = np.zeros(X.shape)
     for j in range(X.shape[-1]):

@@ -29,7 +29,8 @@ write() { # FILE SOURCE PYTHON: the pins under two lines that say what they are
     say "$1: $(wc -l <"$2") pins"
 }
 
-resolve torch,mesh,app,dev --system-site-packages
+resolve torch,mesh,app,dev,benchmark --system-site-packages
+echo torch-fem==0.14.0 >>"$PINS" # asks for a newer scipy than Debian's: installed without its dependencies
 resolve torch,mesh,app,test
 write ci/constraints.txt "$PINS" 3.11
 if [ -x .venv-011/bin/python ]; then

@@ -255,7 +255,7 @@ class Problem:
         self._warped_form = form(ufl.inner(missing, space.gradient(test)) * dx)
         matrix = create_matrix(laplacian)
         assemble(matrix, laplacian, space.conditions)
-        self._poisson = LinearSolver(matrix, space, self._newton.linear.method)
+        self._poisson = LinearSolver(matrix, space, self._newton.linear.method, turns=False)
 
     def _no_worse_than_rest(self, start: Floats, load: Load) -> Floats:
         if self._has_lift(load) or self.material.is_linear or self._space.mixed:
@@ -391,7 +391,7 @@ class Problem:
         return self._negative_pivots(self._unknowns(displacement), self._unloaded)
 
     def _negative_pivots(self, unknowns: Floats, load: Load) -> int | None:
-        if self._newton.linear.method != "direct" or not self._newton.symmetric:
+        if self._newton.linear.method == "multigrid" or not self._newton.symmetric:
             return None
         self._newton.assemble(unknowns, load)
         pivots = self._newton.linear.negative_pivots()

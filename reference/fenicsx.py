@@ -12,7 +12,6 @@ import inspect
 import logging
 import os
 import platform
-import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +23,7 @@ import petsc4py
 from mpi4py import MPI  # before PETSc, which would start MPI without the threads that the task farm needs
 
 # PETSc's own handler turns SIGTERM and SIGPIPE into MPI_Abort; Python's must stay.
-petsc4py.init([sys.argv[0] if sys.argv else "softtwin", "-no_signal_handler"])
+petsc4py.init(["softtwin", "-no_signal_handler"])
 
 import dolfinx
 import numpy as np

@@ -1,4 +1,4 @@
-"""Linear algebra by size: MUMPS for small bodies, conjugate gradients with algebraic multigrid for large ones."""
+"""Linear algebra by size and shape: band Cholesky for slender bodies, MUMPS for others, multigrid for large ones."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .band import BandFactor, band_order
 from .discretisation import Discretisation, rigid_motions
 from .fenicsx import PETSc, ghosted_vector
 
 Floats = NDArray[np.float64]
-Method = Literal["auto", "direct", "multigrid"]
-METHODS = ("auto", "direct", "multigrid")
+Method = Literal["auto", "band", "mumps", "multigrid"]
+METHODS = ("auto", "band", "mumps", "multigrid")
 
 # Unknowns in space above which multigrid is faster than MUMPS (benchmarks/growth.py).
 _DIRECT_LIMIT = 40_000
@@ -21,21 +22,25 @@ _NEWTON_TOLERANCE = 1e-3  # of the linear solves within Newton's method
 
 
 def chosen_method(method: Method, space: Discretisation, symmetric: bool = True) -> Method:
-    """`direct` or `multigrid` for a body: what was asked for, or what suits its size.
+    """What was asked for, or what suits a body's size; `band` still looks at its shape.
 
     Raises:
-        ValueError: multigrid for a problem with pressures as unknowns.
+        ValueError: multigrid for a problem with pressures as unknowns, band for a mesh that is shared.
     """
-    if space.mixed:
-        if method == "multigrid":
-            raise ValueError(
-                "NewtonOptions.linear: expected 'direct' for an incompressible material, got 'multigrid': "
-                "its tangent is indefinite."
-            )
-        return "direct"
+    if space.mixed and method == "multigrid":
+        raise ValueError(
+            "NewtonOptions.linear: expected 'mumps' for an incompressible material, got 'multigrid': "
+            "its tangent is indefinite."
+        )
+    if space.comm.size > 1 and method == "band":
+        raise ValueError("NewtonOptions.linear: expected 'mumps' or 'multigrid' for a shared mesh, got 'band'.")
+    if space.mixed or (method == "band" and not symmetric):
+        return "mumps"
     if method != "auto":
         return method
-    return "multigrid" if space.body.dimension == 3 and space.size > _DIRECT_LIMIT else "direct"
+    if space.body.dimension == 3 and space.size > _DIRECT_LIMIT:
+        return "multigrid"
+    return "band" if symmetric and space.comm.size == 1 else "mumps"
 
 
 class LinearSolver:
@@ -44,32 +49,52 @@ class LinearSolver:
     Args:
         matrix: the PETSc matrix.
         space: the body's discretisation.
-        method: `direct` or `multigrid`.
+        method: `band`, `mumps` or `multigrid`; `band` means MUMPS for a body that is not slender.
         ksp: the solver to set up, SNES's own for instance; a new one if not given.
         symmetric: MUMPS factors L D L^T, which is cheaper than L U and counts negative pivots.
+        turns: rotations cost next to no energy (elasticity), and not translations alone (Poisson's problem).
     """
 
     def __init__(
-        self, matrix: Any, space: Discretisation, method: Method, ksp: Any = None, symmetric: bool = True
+        self,
+        matrix: Any,
+        space: Discretisation,
+        method: Method,
+        ksp: Any = None,
+        symmetric: bool = True,
+        turns: bool = True,
     ) -> None:
         self.matrix, self.method, self.symmetric = matrix, method, symmetric
-        self._space = space
+        self._space, self._turns = space, turns
         self.ksp = PETSc.KSP().create(space.comm) if ksp is None else ksp
         self._owns = ksp is None
         self._near_null: Any = None
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         matrix.setOption(PETSc.Mat.Option.SYMMETRY_ETERNAL, symmetric)
+        self._band: _Band | None = None
         self.ksp.setOperators(matrix)
-        if method == "direct":
-            self._use_mumps()
-        else:
+        if method == "multigrid":
             self._use_multigrid()
+        else:
+            order = self._order() if method == "band" else None
+            if order is None:
+                _use_mumps(self.ksp, symmetric)
+            else:
+                self._use_band(order)
 
-    def _use_mumps(self) -> None:
+    def _order(self) -> NDArray[np.int64] | None:
+        """The order of elimination for a band, found once for a body; None where it is not slender."""
+        space = self._space
+        if space.elimination is None:
+            found = band_order(self.matrix, space.body.points, space.nodes)
+            space.elimination = np.empty(0, dtype=np.int64) if found is None else found
+        return space.elimination if len(space.elimination) else None
+
+    def _use_band(self, order: NDArray[np.int64]) -> None:
+        """Band factors stay outside of PETSc, whose Python preconditioners crash when an interpreter ends."""
+        self._band = _Band(BandFactor(self.matrix, order), self.matrix)
         self.ksp.setType("preonly")
-        pc = self.ksp.getPC()
-        pc.setType("cholesky" if self.symmetric else "lu")
-        pc.setFactorSolverType("mumps")
+        self.ksp.getPC().setType("none")
 
     def _use_multigrid(self) -> None:
         """Smoothed aggregation that knows the rigid motions (Vanek, Mandel and Brezina 1996)."""
@@ -87,7 +112,7 @@ class LinearSolver:
                 "pc_gamg_reuse_interpolation": True,
                 "mg_levels_ksp_type": "chebyshev",
                 "mg_levels_pc_type": "jacobi",
-                "mg_levels_ksp_max_it": 3,
+                "mg_levels_ksp_max_it": 2,
                 "mg_levels_esteig_ksp_type": "cg",
                 "mg_levels_esteig_ksp_max_it": 10,
             },
@@ -96,7 +121,8 @@ class LinearSolver:
     def _set_near_nullspace(self) -> None:
         space = self._space
         vectors: list[Floats] = []
-        for motion in rigid_motions(space.body.points):
+        motions = rigid_motions(space.body.points)
+        for motion in motions if self._turns else motions[: space.body.dimension]:
             values = space.unknowns("motion", motion)
             values[space.fixed] = 0.0
             for done in vectors:
@@ -126,8 +152,18 @@ class LinearSolver:
 
     def prepare(self) -> None:
         """Factor the matrix (or build its multigrid) as it is now."""
+        if self._band is not None:
+            self._band.prepare()
+            return
         self.ksp.setOperators(self.matrix)
         self.ksp.setUp()
+
+    def finished(self, direction: Floats) -> Floats:
+        """What SNES's own solver gave as a direction, with the work that was left outside of PETSc."""
+        if self._band is None:
+            return direction
+        self._band.prepare()
+        return self._band.solve(direction[None])[0]
 
     def solve(self, rows: Floats, transpose: bool = False) -> Floats:
         """K^-1 applied to each row, (k, owned unknowns).
@@ -137,8 +173,10 @@ class LinearSolver:
         """
         self.tighten()
         self.prepare()
-        if self.method == "direct" and len(rows) > 1 and self._space.comm.size == 1 and not transpose:
-            return self._solve_dense(rows)
+        if self._band is not None:
+            return self._band.solve(rows)
+        if self.method != "multigrid" and len(rows) > 1 and self._space.comm.size == 1 and not transpose:
+            return _solve_dense(self.ksp, rows)
         b, x = self.matrix.createVecLeft(), self.matrix.createVecRight()
         out = np.empty_like(rows)
         for i, row in enumerate(rows):
@@ -147,38 +185,86 @@ class LinearSolver:
             if self.ksp.getConvergedReason() < 0:
                 raise RuntimeError(
                     f"LinearSolver.solve: {self.method} did not converge in {self.ksp.getIterationNumber()} "
-                    "iterations; NewtonOptions(linear='direct') may."
+                    "iterations; NewtonOptions(linear='mumps') may."
                 )
             out[i] = x.array_r
         b.destroy()
         x.destroy()
         return out
 
-    def _solve_dense(self, rows: Floats) -> Floats:
-        count, unknowns = rows.shape
-        factors = self.ksp.getPC().getFactorMatrix()
-        b = PETSc.Mat().createDense((unknowns, count), array=rows.ravel(), comm=self._space.comm)
-        x = PETSc.Mat().createDense((unknowns, count), comm=self._space.comm)
-        x.setUp()
-        factors.matSolve(b, x)
-        result = x.getDenseArray().T.copy()
-        b.destroy()
-        x.destroy()
-        return np.asarray(result)
-
     def negative_pivots(self) -> int | None:
         """Negative eigenvalues of the matrix, as many as D has (Sylvester); None where nothing was factored."""
-        if self.method != "direct" or not self.symmetric:
+        if self.method == "multigrid" or not self.symmetric:
             return None
         self.prepare()
-        return int(self.ksp.getPC().getFactorMatrix().getMumpsInfog(12))
+        return _pivots(self.ksp) if self._band is None else self._band.negative_pivots()
 
     def close(self) -> None:
         """Free the PETSc objects, the matrix excepted."""
+        if self._band is not None:
+            self._band.close()
         if self._near_null is not None:
             self._near_null.destroy()
         if self._owns:
             self.ksp.destroy()
+
+
+class _Band:
+    """A band factor of a matrix that changes; where it is not positive definite MUMPS factors it."""
+
+    def __init__(self, factor: BandFactor, matrix: Any) -> None:
+        self._factor, self._matrix = factor, matrix
+        self._factored: int | None = None
+        self._definite = True
+        self._mumps: Any = None
+
+    def prepare(self) -> None:
+        """Factor the matrix unless it has been as it is."""
+        state = self._matrix.stateGet()
+        if state == self._factored:
+            return
+        self._factored = None
+        self._definite = self._factor.factor(self._matrix)
+        if not self._definite:
+            if self._mumps is None:
+                self._mumps = PETSc.KSP().create(self._matrix.comm)
+                _use_mumps(self._mumps, symmetric=True)
+            self._mumps.setOperators(self._matrix)
+            self._mumps.setUp()
+        self._factored = state
+
+    def solve(self, rows: Floats) -> Floats:
+        return self._factor.solve(rows) if self._definite else _solve_dense(self._mumps, rows)
+
+    def negative_pivots(self) -> int:
+        return 0 if self._definite else _pivots(self._mumps)
+
+    def close(self) -> None:
+        if self._mumps is not None:
+            self._mumps.destroy()
+
+
+def _use_mumps(ksp: Any, symmetric: bool) -> None:
+    ksp.setType("preonly")
+    ksp.getPC().setType("cholesky" if symmetric else "lu")
+    ksp.getPC().setFactorSolverType("mumps")
+
+
+def _pivots(ksp: Any) -> int:
+    return int(ksp.getPC().getFactorMatrix().getMumpsInfog(12))
+
+
+def _solve_dense(ksp: Any, rows: Floats) -> Floats:
+    """MUMPS's inverse applied to each row, on one rank."""
+    count, unknowns = rows.shape
+    b = PETSc.Mat().createDense((unknowns, count), array=np.array(rows).ravel(), comm=ksp.comm)
+    x = PETSc.Mat().createDense((unknowns, count), comm=ksp.comm)
+    x.setUp()
+    ksp.getPC().getFactorMatrix().matSolve(b, x)
+    result = x.getDenseArray().T.copy()
+    b.destroy()
+    x.destroy()
+    return np.asarray(result)
 
 
 _count = 0

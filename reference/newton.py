@@ -41,7 +41,8 @@ class NewtonOptions:
             energy to decrease and takes `full` steps for `energy`.
         first_step: part of the load that is tried first; 1 tries the whole load at once, and steps only if that fails.
         chord: keep a factorisation while it converges fast; False factors in each iteration.
-        linear: `direct` (MUMPS), `multigrid` (conjugate gradients with smoothed aggregation), `auto` by size.
+        linear: `band` (LAPACK, for slender bodies; MUMPS for others), `mumps`, `multigrid` (conjugate gradients with
+            smoothed aggregation), or `auto` by size and shape.
     """
 
     tolerance: float = 1e-8
@@ -100,6 +101,8 @@ class Newton:
         self._snes: Any = None
         self.linear: LinearSolver
         self.factored_at: tuple[Floats, dict[str, float]] | None = None
+        rest = np.zeros(self.space.owned)
+        forms.tangent(rest, Load(rest, rest, {}), self.matrix)  # the linear solver looks at its sparsity
         self._make_solver(symmetric=True)
         self.forget()
         self.start_count()
@@ -115,7 +118,7 @@ class Newton:
         snes.setJacobian(self._jacobian, self.matrix)
         snes.setLineSearchPreCheck(self._precheck)
         snes.setConvergenceTest(self._test)
-        method = chosen_method(self.options.linear, self.space)
+        method = chosen_method(self.options.linear, self.space, symmetric)
         self.linear = LinearSolver(self.matrix, self.space, method, snes.getKSP(), symmetric)
         _set_line_search(snes, self.search if self.search in ("bt", "l2", "cp") else "basic")
         self._snes, self.symmetric = snes, symmetric
@@ -217,9 +220,10 @@ class Newton:
 
     def _precheck(self, x: Any, y: Any) -> bool:
         """Shorten (or turn) the Newton direction; SNES then takes x - y whole, or its own search goes on from there."""
+        unknowns, step = np.array(x.array_r), self.linear.finished(np.array(y.array_r))
         if self.search in ("bt", "l2", "cp"):
-            return False
-        unknowns, step = np.array(x.array_r), np.array(y.array_r)
+            y.array[:] = step
+            return True
         if self.search == "full":
             self._length = self._admissible(unknowns, step)
         else:

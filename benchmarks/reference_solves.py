@@ -1,0 +1,151 @@
+"""What solves of the reference cost: the 12,000-unknown beam, the real liver from rest, gradients, memory. One core.
+
+python benchmarks/reference_solves.py
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from beam_hard import draw
+from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
+from numpy.typing import NDArray
+from record import write
+from scipy.optimize import brentq
+from threadpoolctl import threadpool_limits
+
+from softtwin.meshes.shapes import beam
+from softtwin.reference.equilibrium import NewtonOptions, Problem
+from softtwin.reference.materials import NeoHookean, SaintVenantKirchhoff
+from softtwin.reference.sensitivity import Linearisation
+
+Floats = NDArray[np.float64]
+
+
+def median_s(call: Callable[[], Any], repeats: int) -> float:
+    """Median wall time of a call, seconds."""
+    seconds = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - begin)
+    return float(np.median(seconds))
+
+
+def large_beam() -> dict[str, Any]:
+    """The beam of the thesis's Table 5.1: 12,000 unknowns, 100 m long, bent by about 40 m (nu, not given there, 0.3)."""
+    body, material = beam((39, 9, 9), (100.0, 25.0, 25.0), "hexahedron"), SaintVenantKirchhoff(4500.0, 0.3)
+    tip = body.node_sets["tip"]
+    unit = np.zeros_like(body.points)
+    unit[tip, 2] = 1.0 / len(tip)
+    plain = NewtonOptions(chord=False)
+    with Problem(body, material) as problem, Problem(body, material, plain) as newton:
+
+        def excess(newtons: float) -> float:
+            return float(problem.solve(newtons * unit, stability=False).displacement[tip, 2].mean() - 40.0)
+
+        forces = brentq(excess, 1e4, 3e4, rtol=1e-3) * unit
+        state = problem.solve(forces, stability=False)
+        rest = np.zeros_like(body.points)
+        each = newton.solve(forces, rest, stability=False)
+        return {
+            "unknowns": problem.size,
+            "tip_m": float(state.displacement[tip, 2].mean()),
+            "solve_s": median_s(lambda: problem.solve(forces, stability=False), 9),
+            "iterations": state.iterations,
+            "factorisations": state.factorisations,
+            "newton_iteration_s": median_s(lambda: newton.solve(forces, rest, stability=False), 5) / each.iterations,
+            "newton_iterations_from_rest": each.iterations,
+        }
+
+
+def real_liver() -> dict[str, Any]:
+    """Cold start under the true load of frame 0 of each sequence: time, and distance from the stored truth."""
+    body, figures = liver(), {}
+    with Problem(body, NeoHookean(YOUNG_MODULUS, POISSON_RATIO)) as problem:
+        for name in SEQUENCES:
+            data = sequence(name)
+            forces = np.zeros_like(body.points)
+            forces[data.tool] = data.net_forces[0] / len(data.tool)
+            state = problem.solve(forces)
+            figures[name] = {
+                "seconds": median_s(lambda forces=forces: problem.solve(forces, stability=False), 5),
+                "seconds_with_stability": median_s(lambda forces=forces: problem.solve(forces), 3),
+                "iterations": state.iterations,
+                "factorisations": state.factorisations,
+                "load_steps": state.load_steps,
+                "negative_pivots": state.negative_pivots,
+                "largest_error_m": float(np.abs(body.points + state.displacement - data.positions[0]).max()),
+            }
+    return figures
+
+
+def gradients() -> dict[str, Any]:
+    """A gradient by all nodal forces against the solve that came before it: on the beam and on the liver."""
+    bar, organ, data = beam(), liver(), sequence("s2")
+    load = np.zeros_like(organ.points)
+    load[data.tool] = data.net_forces[0] / len(data.tool)
+    cases = {"beam": (bar, draw(bar, np.random.default_rng(0))), "liver": (organ, load)}
+    figures = {}
+    for name, (body, forces) in cases.items():
+        cotangent = np.random.default_rng(0).standard_normal(body.points.shape)
+        with Problem(body, NeoHookean(YOUNG_MODULUS, POISSON_RATIO)) as problem:
+            problem.solve(forces)
+            rows = []
+            for stability in (True, False):
+                for _ in range(7):
+                    begin = time.perf_counter()
+                    state = problem.solve(forces, stability=stability)
+                    solved = time.perf_counter()
+                    Linearisation(problem, forces, state).adjoint(cotangent)
+                    rows.append((stability, solved - begin, time.perf_counter() - solved))
+            for stability in (True, False):
+                solve, gradient = np.median([row[1:] for row in rows if row[0] == stability], axis=0)
+                key = "after_a_solve_with_stability" if stability else "after_a_solve_without"
+                figures[f"{name}, {key}"] = {"solve_s": solve, "gradient_s": gradient, "ratio": gradient / solve}
+            Linearisation(problem, forces, state).gradient(cotangent)  # compiles
+            whole = median_s(lambda: Linearisation(problem, forces, state).gradient(cotangent), 5)
+            figures[f"{name}, by forces and parameters"] = {"gradient_s": whole}
+    return figures
+
+
+def memory(count: int = 1000) -> dict[str, Any]:
+    """Resident memory of one process after 50 solves and after all, MiB."""
+    body = beam()
+    rng = np.random.default_rng(1)
+    seen = {}
+    with Problem(body, NeoHookean(YOUNG_MODULUS, POISSON_RATIO)) as problem:
+        for i in range(1, count + 1):
+            problem.solve(draw(body, rng))
+            if i in (50, count):
+                seen[i] = resident_MiB()
+    return {
+        "solves": count,
+        "after_50_MiB": seen[50],
+        "after_all_MiB": seen[count],
+        "growth_MiB": seen[count] - seen[50],
+    }
+
+
+def resident_MiB() -> float:  # noqa: N802 - the unit's own letters
+    """Resident memory of this process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def main() -> None:
+    figures = {}
+    with threadpool_limits(1):
+        for study in (large_beam, real_liver, gradients, memory):
+            figures[study.__name__] = study()
+            print(study.__name__, figures[study.__name__], flush=True)
+    write("reference_solves", figures)
+
+
+if __name__ == "__main__":
+    main()
