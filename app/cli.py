@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.files import UnitWarning
 
-from .config import Config, ConfigError, parse_config, to_toml
+from .config import LAWS, Config, ConfigError, parse_config, to_toml
 from .register import NOTICE
 
 _PATH = click.Path(path_type=Path)
@@ -167,9 +167,7 @@ def report(configuration: Path) -> None:
 @click.option("--nodes", type=int, default=2000, show_default=True, help="Nodes wanted where a surface is made solid.")
 @click.option("--cell-size", type=float, default=0.0, help="Edge length instead, metres.")
 @click.option("--repair", is_flag=True, help="Mend an open or self-intersecting surface first.")
-@click.option(
-    "--law", type=click.Choice(["neo-hookean", "saint-venant-kirchhoff"]), default="neo-hookean", show_default=True
-)
+@click.option("--law", type=click.Choice(LAWS), default="neo-hookean", show_default=True)
 @click.option("--young-modulus", type=float, default=5000.0, show_default=True, help="Pascals.")
 @click.option("--poisson-ratio", type=float, default=0.45, show_default=True)
 @click.option(

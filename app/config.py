@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -49,10 +49,14 @@ class BodySection(_Section):
     )
 
 
+Law = Literal["neo-hookean", "saint-venant-kirchhoff", "isochoric-neo-hookean", "linear-elastic"]
+LAWS: tuple[str, ...] = get_args(Law)
+
+
 class MaterialSection(_Section):
     """The tissue."""
 
-    law: Literal["neo-hookean", "saint-venant-kirchhoff"] = Field("neo-hookean", description="strain energy")
+    law: Law = Field("neo-hookean", description="strain energy")
     young_modulus: Positive = Field(5000.0, description="pascals")
     poisson_ratio: float = Field(0.45, gt=0.0, lt=0.5, description="between 0 and 0.5; soft tissue 0.45 to 0.49")
 

@@ -13,8 +13,9 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from vtkmodules.vtkCommonCore import mutable
 
-from .body import HEXAHEDRON_FACES, TETRAHEDRON_FACES, Body, Floats, Ints, Surface
+from .body import Body, Floats, Ints, Surface
 from .clouds import cell_locator
+from .elements import split_facets
 
 # Corners of the reference cube in VTK order.
 _CUBE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], dtype=float)
@@ -72,7 +73,7 @@ def embed(body: Body, points: ArrayLike) -> Embedding:
         points: positions at rest, (p, 3), metres.
 
     Raises:
-        ValueError: wrong shape or numbers that are not finite.
+        ValueError: wrong shape, numbers that are not finite, or curved cells.
     """
     positions = np.asarray(points, dtype=np.float64)
     if positions.ndim != 2 or positions.shape[1] != 3:
@@ -85,10 +86,14 @@ def embed(body: Body, points: ArrayLike) -> Embedding:
     lost = np.flatnonzero(cells < 0)
     if len(lost):
         cells[lost], positions[lost], outside[lost] = _nearest(body, positions[lost])
+    if not body.is_straight:
+        raise ValueError("body: expected straight cells, got curved ones; points are found in linear cells alone.")
     if body.is_tetrahedral:
         weights = _tetrahedron_weights(body, cells, positions)
     else:
         weights = _trilinear(_local_coordinates(body, cells, positions))
+    if body.kind.degree == 2:
+        weights = _quadratic(body, weights)
     return Embedding(cells, body.cells[cells], weights, outside, len(body.points))
 
 
@@ -122,7 +127,7 @@ def _containing_cells(body: Body, points: Floats) -> Ints:
 
 def _candidates(body: Body, points: Floats) -> tuple[Ints, Ints]:
     """Pairs of cell number and point number such that the point lies in the cell's bounding box."""
-    corners = body.points[body.cells]
+    corners = body.points[body.corner_cells]
     low, high = corners.min(axis=1), corners.max(axis=1)
     slack = _TOLERANCE * body.size
     near = cKDTree(points).query_ball_point((low + high) / 2, np.linalg.norm(high - low, axis=1) / 2 + slack)
@@ -157,16 +162,28 @@ def _nearest(body: Body, points: Floats) -> tuple[Ints, Floats, Floats]:
 
 def _owners(body: Body) -> Ints:
     """Number of the cell behind each triangle of the boundary."""
-    local = TETRAHEDRON_FACES if body.is_tetrahedral else HEXAHEDRON_FACES
-    faces = body.cells[:, local].reshape(-1, local.shape[1])
-    halves = faces if body.is_tetrahedral else faces[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-    per_cell = len(halves) // len(body.cells)
-    known = {tuple(corners): i // per_cell for i, corners in enumerate(halves.tolist())}
+    local = np.array(body.kind.facets)
+    pieces = split_facets(body.cells[:, local].reshape(-1, local.shape[1]), body.kind.pieces)
+    per_cell = len(pieces) // len(body.cells)
+    known = {tuple(corners): i // per_cell for i, corners in enumerate(pieces.tolist())}
     return np.array([known[tuple(corners)] for corners in body.boundary.tolist()])
 
 
+def _quadratic(body: Body, weights: Floats) -> Floats:
+    """Weights of all nodes of a straight quadratic cell from the linear weights of its corners."""
+    kind = body.kind
+    if body.is_tetrahedral:
+        first, second = np.array(kind.parents).T
+        return np.column_stack([weights * (2 * weights - 1), 4 * weights[:, first] * weights[:, second]])
+    xi = weights @ _CUBE
+    nodes = np.array([*_CUBE, *(_CUBE[list(group)].mean(axis=0) for group in kind.parents)])
+    # Along each axis the nodes are at 0, 1/2 and 1.
+    basis = np.stack([(1 - xi) * (1 - 2 * xi), 4 * xi * (1 - xi), xi * (2 * xi - 1)], axis=2)
+    return np.prod([basis[:, axis, np.rint(2 * nodes[:, axis]).astype(int)] for axis in range(3)], axis=0)
+
+
 def _tetrahedron_weights(body: Body, cells: Ints, points: Floats) -> Floats:
-    corners = body.points[body.cells[cells]]
+    corners = body.points[body.corner_cells[cells]]
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     last = np.linalg.solve(edges, (points - corners[:, 0])[:, :, None])[:, :, 0]
     return np.column_stack([1 - last.sum(axis=1), last])
@@ -174,7 +191,7 @@ def _tetrahedron_weights(body: Body, cells: Ints, points: Floats) -> Floats:
 
 def _local_coordinates(body: Body, cells: Ints, points: Floats) -> Floats:
     """Coordinates in the reference cube, (p, 3), by Newton's method on the trilinear map."""
-    corners = body.points[body.cells[cells]]
+    corners = body.points[body.corner_cells[cells]]
     xi = np.full((len(points), 3), 0.5)
     for _ in range(_NEWTON_STEPS):
         gap = points - np.einsum("pk,pki->pi", _trilinear(xi), corners)

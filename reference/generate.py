@@ -45,9 +45,9 @@ class Plan:
     """What to generate: enough, with a body, to make a data set again.
 
     Args:
-        material: name of the strain energy, `neo-hookean` or `saint-venant-kirchhoff`.
+        material: name of the strain energy, one of `MATERIALS`.
         young_modulus: pascals.
-        poisson_ratio: in (0, 0.5).
+        poisson_ratio: in [0, 0.5).
         loads: how loads are drawn.
         samples: draws of each split.
         block: draws of one block, the unit of work and of storage.

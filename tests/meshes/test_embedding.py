@@ -3,6 +3,7 @@ import pytest
 
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.embedding import carried, embed
+from softtwin.meshes.shapes import beam
 
 EPS = np.finfo(float).eps
 
@@ -99,3 +100,22 @@ def test_what_is_no_point_is_refused(bar: Body, points: object, message: str) ->
 def test_a_field_of_another_body_is_refused(bar: Body) -> None:
     with pytest.raises(ValueError, match=r"displacement: expected shape \(60, 3\), got \(7, 3\)"):
         embed(bar, bar.points).displace(np.zeros((7, 3)))
+
+
+@pytest.mark.parametrize("kind", ["tetrahedron", "hexahedron"])
+def test_quadratic_cells_carry_quadratic_fields_exactly(kind: str) -> None:
+    body = beam((3, 2, 2), (0.6, 0.2, 0.2), kind).quadratic()
+
+    def field(x: np.ndarray) -> np.ndarray:
+        return np.stack([x[:, 0] * x[:, 1], x[:, 2] ** 2 - x[:, 0], x[:, 1] * x[:, 2]], axis=1)
+
+    points = _inside(body, 200)
+    assert np.abs(embed(body, points).displace(field(body.points)) - field(points)).max() < 1e3 * EPS
+
+
+def test_curved_cells_are_refused() -> None:
+    straight = beam((3, 2, 2), (0.6, 0.2, 0.2), "tetrahedron").quadratic()
+    points = straight.points.copy()
+    points[-1] += 1e-3
+    with pytest.raises(ValueError, match="expected straight cells"):
+        embed(Body(points, straight.cells, dict(straight.node_sets)), points[:3])
