@@ -134,7 +134,10 @@ def simple_shear(material: Material, kind: str, shear: float = SHEAR) -> Row:
 
 
 def twisted(body: Body, material: Material, angle: float, is_finite: bool = True) -> tuple[float, float]:
-    """Torque and axial force that twist a cylinder's far end by an angle per length, its length kept."""
+    """Torque and axial force that twist a cylinder's far end by an angle per length, its length kept.
+
+    Rotations are finite, or small as linear elasticity knows them.
+    """
     end = body.node_sets["z1"]
     x, y, z = body.points[end].T
     turn = angle * z

@@ -202,7 +202,7 @@ class Discretisation:
         gradient = ufl.grad(displacement)
         if self.body.dimension == 3:
             return gradient
-        (a, b), (c, d) = ((gradient[i, j] for j in range(2)) for i in range(2))
+        (a, b), (c, d) = ([gradient[i, j] for j in range(2)] for i in range(2))
         return ufl.as_tensor([[a, b, 0], [c, d, 0], [0, 0, 0]])
 
     def deformation_gradient(self, displacement: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, Literal
 
 import numpy as np
@@ -69,6 +70,7 @@ class LinearSolver:
         self.ksp = PETSc.KSP().create(space.comm) if ksp is None else ksp
         self._owns = ksp is None
         self._near_null: Any = None
+        self._keys: list[str] = []
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         matrix.setOption(PETSc.Mat.Option.SYMMETRY_ETERNAL, symmetric)
         self._band: _Band | None = None
@@ -103,7 +105,7 @@ class LinearSolver:
         self.ksp.setTolerances(rtol=_RELATIVE_TOLERANCE, max_it=500)
         pc = self.ksp.getPC()
         pc.setType("gamg")
-        _set_options(
+        self._keys = _set_options(
             pc,
             {
                 "pc_gamg_type": "agg",
@@ -113,8 +115,6 @@ class LinearSolver:
                 "mg_levels_ksp_type": "chebyshev",
                 "mg_levels_pc_type": "jacobi",
                 "mg_levels_ksp_max_it": 2,
-                "mg_levels_esteig_ksp_type": "cg",
-                "mg_levels_esteig_ksp_max_it": 10,
             },
         )
 
@@ -205,6 +205,8 @@ class LinearSolver:
             self._band.close()
         if self._near_null is not None:
             self._near_null.destroy()
+        for key in self._keys:
+            PETSc.Options().delValue(key)
         if self._owns:
             self.ksp.destroy()
 
@@ -267,16 +269,15 @@ def _solve_dense(ksp: Any, rows: Floats) -> Floats:
     return np.asarray(result)
 
 
-_count = 0
+_count = itertools.count()
 
 
-def _set_options(pc: Any, values: dict[str, Any]) -> None:
-    """Set options of one preconditioner and leave the database as it was."""
-    global _count
-    _count += 1
-    prefix = f"softtwin_pc_{_count}_"
+def _set_options(pc: Any, values: dict[str, Any]) -> list[str]:
+    """Set options of one preconditioner, which reads some of them when it is built: their keys, to be deleted then."""
+    prefix = f"softtwin_pc_{next(_count)}_"
     pc.setOptionsPrefix(prefix)
     options = PETSc.Options()
     for name, value in values.items():
         options[prefix + name] = value
     pc.setFromOptions()
+    return [prefix + name for name in values]
