@@ -6,6 +6,7 @@ conditioning; ROUND_OFF is a few thousand units of double precision, for sums ov
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -96,7 +97,7 @@ def test_a_uniform_deformation_is_kept_by_curved_cells(kind: str) -> None:
     assert row["displacement_error"] < ROUND_OFF and row["force_error"] < ROUND_OFF, row
 
 
-@pytest.mark.parametrize("kind", QUADRATIC)
+@pytest.mark.parametrize("kind", ["triangle6", "quad9", "tetra10"])
 def test_mixed_cells_keep_a_uniform_deformation_and_its_pressure(kind: str) -> None:
     row = patch_with_traction(INCOMPRESSIBLE["incompressible Neo-Hookean"], kind)
     assert max(row["displacement_error"], row["force_error"], row["pressure_error"]) < SOLVED, row
@@ -191,7 +192,9 @@ def test_sensitivities_by_parameters_of_each_cell_pass_taylor_tests(size: float)
 
 
 def test_cooks_slab_has_the_displacements_that_dealii_publishes() -> None:
-    for row in cook_tables(cooks()["slab"], 4):
+    case = cooks()["slab"]
+    linear = replace(case, tables={"hexahedron": case.tables["hexahedron"]})
+    for row in cook_tables(linear, 8):
         assert abs(row["found"] - row["published"]) <= 0.0051, row  # two decimals are published
 
 
@@ -209,10 +212,8 @@ def test_the_cantilever_meets_timoshenkos_beam() -> None:
 
 
 def test_linear_cells_lock_and_mixed_cells_do_not() -> None:
-    best = tip_deflection("hexahedron27", True, 0.4999, 2)
-    relative = {
-        (kind, is_mixed): tip_deflection(kind, is_mixed, 0.4999, 2) / best
-        for kind, is_mixed in (("tetra", False), ("hexahedron", False), ("tetra10", True))
-    }
-    assert relative["tetra", False] < 0.1 and relative["hexahedron", False] < 0.2, relative
-    assert relative["tetra10", True] > 0.95, relative
+    free = {nu: tip_deflection("tetra10", True, nu, 2) for nu in (0.49, 0.4999)}
+    # The tissue itself is stiffer by a few 1e-3; a locking element would feel a bulk modulus that is 100 times larger.
+    assert free[0.4999] == pytest.approx(free[0.49], rel=1e-2), free
+    locked = {kind: tip_deflection(kind, False, 0.4999, 2) / free[0.4999] for kind in ("tetra", "hexahedron")}
+    assert locked["tetra"] < 0.1 and locked["hexahedron"] < 0.2, locked
