@@ -28,6 +28,7 @@ __all__ = ["Loading", "NewtonOptions", "Problem"]
 Floats = NDArray[np.float64]
 _GROWTH, _CUT = 1.5, 0.5  # of load steps after a success and a failure
 _FIRST_STEP = 0.25  # of the load where the whole load has failed
+_SMALLEST_STEP = 1e-6  # of the load; where not even that can be added there is a limit point
 _LOST = 1e-12  # relative force on held nodes that may be round-off
 
 
@@ -278,19 +279,27 @@ class Problem:
             spent += attempt.iterations
             if not attempt.converged:
                 step *= _CUT
+                if step < _SMALLEST_STEP:
+                    break
                 continue
             reached, state, good, last = target, attempt.unknowns, good + 1, attempt
             step *= _GROWTH
             if reached == 1.0:
                 return self._result(replace(attempt, iterations=spent), load, good, stability, trace)
-        found = None if last is None else self._result(last, load.scaled(reached), good, False, False)
+        lines = tuple(self._newton.trace)
+        found = None if last is None else self._result(last, load.scaled(reached), good, True, False)
+        advice = (
+            "No more load can be added there: a limit point, or a mesh too coarse for it. Try a smaller load, a finer "
+            "mesh, or displacements prescribed instead of forces."
+            if step < _SMALLEST_STEP
+            else "Try a smaller load, a finer mesh where it acts, or more max_load_steps."
+        )
         raise NotConverged(
-            f"Problem.solve: no equilibrium after {spent} Newton iterations in {self.options.max_load_steps} load "
-            f"steps; {100 * reached:.1f} % of the load was reached (last reason: {attempt.reason_name}, residual "
-            f"{attempt.residual:.2g} N). Try a smaller load, a finer mesh where it acts, or more max_load_steps.",
+            f"Problem.solve: no equilibrium after {spent} Newton iterations in load steps; {100 * reached:.1f} % of "
+            f"the load was reached (last reason: {attempt.reason_name}, residual {attempt.residual:.2g} N). {advice}",
             reached,
             found,
-            tuple(self._newton.trace),
+            lines,
         )
 
     def _result(self, attempt: Attempt, load: Load, load_steps: int, stability: bool, trace: bool) -> Equilibrium:

@@ -30,6 +30,7 @@ import numpy as np
 import ufl
 from dolfinx import fem, mesh
 from dolfinx.fem import petsc as fem_petsc
+from dolfinx.jit import ffcx_jit
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
@@ -255,11 +256,16 @@ def form(expression: Any) -> Any:
         "cache_dir": cache,
         "timeout": _COMPILE_TIMEOUT_S,
     }
-    name = "jit_options" if "jit_options" in inspect.signature(fem.form).parameters else "jit_params"
-    # Ranks that share a mesh compile together: only the first may hold the lock, or the others would wait for it.
-    alone = expression.ufl_domains()[0].ufl_cargo().comm.rank == 0
-    with quiet_jit(), _compiling(cache) if alone else contextlib.nullcontext():
-        return fem.form(expression, **{name: jit})
+    new = "jit_options" in inspect.signature(fem.form).parameters
+    with quiet_jit():
+        if expression.ufl_domains()[0].ufl_cargo().comm.size == 1:
+            with _compiling(cache):
+                return fem.form(expression, **{"jit_options" if new else "jit_params": jit})
+        # Ranks that share a mesh would wait for each other in the lock: each one compiles, or loads, for itself, and
+        # the collective call finds it in the cache (0.5.2 may give one form another name on each rank).
+        with _compiling(cache):
+            ffcx_jit(MPI.COMM_SELF, expression, {"scalar_type": PETSc.ScalarType if new else "double"}, jit)
+        return fem.form(expression, **{"jit_options" if new else "jit_params": jit})
 
 
 def dirichlet(space: Any, domain: Any, unknowns: list[NDArray[np.int64]], mixed: bool) -> list[Any]:

@@ -104,7 +104,7 @@ class Newton:
         rest = np.zeros(self.space.owned)
         forms.tangent(rest, Load(rest, rest, {}), self.matrix)  # the linear solver looks at its sparsity
         self._make_solver(symmetric=True)
-        self.forget()
+        self.forget(self.matrix.norm(PETSc.NormType.NORM_INFINITY))
         self.start_count()
 
     def _make_solver(self, symmetric: bool) -> None:
@@ -130,12 +130,27 @@ class Newton:
         if symmetric != self.symmetric:
             self._make_solver(symmetric)
 
-    def forget(self) -> None:
-        """The material has changed: the factorisation is none of it any more."""
+    def forget(self, stiffness: float | None = None) -> None:
+        """The material has changed: the factorisation is none of it any more.
+
+        Args:
+            stiffness: norm of the tangent at rest, N/m; found anew if not given.
+        """
         self.factored_at = None
-        body = self.space.body
-        noise = float(_EPSILONS * np.finfo(float).eps * self.forms.stiffness_scale())
-        self._round_off, self._energy_noise = noise * _face(body), noise * body.volume
+        if stiffness is None:
+            rest = np.zeros(self.space.owned)
+            self.forms.tangent(rest, Load(rest, rest, {}), self.matrix)
+            stiffness = self.matrix.norm(PETSc.NormType.NORM_INFINITY)
+        self._stiffness = float(stiffness)
+        nothing = np.zeros(self.space.owned)
+        at_rest = self.space.norm(self.forms.residual(nothing, Load(nothing, nothing, {})))
+        self._round_off = _EPSILONS * at_rest  # what rounding leaves of the stresses of a body at rest
+        body, epsilon = self.space.body, float(_EPSILONS * np.finfo(float).eps)
+        modulus = self.forms.stiffness_scale()
+        self._energy_noise = epsilon * modulus * body.volume
+        # F is 1 + grad u: its rounding is a strain, and a random force at each node on the area that belongs to it.
+        nodes, dimension = body.points.shape
+        self._force_noise = epsilon * modulus * (body.volume / nodes) ** (1 - 1 / dimension) * nodes**0.5
 
     def start_count(self) -> None:
         """Forget the counts and the trace of the last solve."""
@@ -161,7 +176,8 @@ class Newton:
         with _interrupts():
             self._snes.solve(None, self._x)
         reason, iterations = int(self._snes.getConvergedReason()), self._snes.getIterationNumber()
-        return Attempt(np.array(self._x.array_r), reason > 0, reason, iterations, float(self._norms[-1]))
+        residual = float(self._norms[-1]) if self._norms else np.nan  # SNES gives up at once on a start inside out
+        return Attempt(np.array(self._x.array_r), reason > 0, reason, iterations, residual)
 
     def _start_tolerance(self, load: Load) -> None:
         scale = self.space.norm(load.dead)
@@ -214,9 +230,19 @@ class Newton:
             return reasons.DIVERGED_FNORM_NAN
         if norm <= self._absolute_tolerance:
             return reasons.CONVERGED_FNORM_ABS
+        if self._is_round_off(snes):
+            return reasons.CONVERGED_SNORM_RELATIVE
         if self._search_failed:
             return reasons.DIVERGED_LINE_SEARCH
         return reasons.DIVERGED_MAX_IT if iteration >= self.options.max_iterations else reasons.ITERATING
+
+    def _is_round_off(self, snes: Any) -> bool:
+        """The residual falls no more, and what is left of it is the rounding of strains and of K u."""
+        stuck = self._search_failed or (len(self._norms) > 1 and self._norms[-1] > 0.5 * self._norms[-2])
+        if not stuck:
+            return False
+        rounded = _EPSILONS * np.finfo(float).eps * self._stiffness * snes.getSolution().norm()
+        return bool(self._norms[-1] <= self._force_noise + rounded)
 
     def _precheck(self, x: Any, y: Any) -> bool:
         """Shorten (or turn) the Newton direction; SNES then takes x - y whole, or its own search goes on from there."""
@@ -264,11 +290,6 @@ class Newton:
         self.linear.close()
         for item in (self._snes, self.matrix, self._residual, self._x):
             item.destroy()
-
-
-def _face(body: Any) -> float:
-    """An area that stresses act on: size squared in space, size in the plane."""
-    return float(body.size ** (body.dimension - 1))
 
 
 def _set_line_search(snes: Any, name: str) -> None:

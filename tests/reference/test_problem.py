@@ -418,3 +418,47 @@ def test_pressures_need_quadratic_cells(box: Body) -> None:
 def test_options_that_cannot_be_are_refused(make, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+# ---------------------------------------------------------------------- what once went wrong
+
+
+def test_a_start_that_is_inside_out_goes_to_load_steps() -> None:
+    """Half a turn of the tip: its linear extension folds cells, and SNES gives up before its first test."""
+    body = beam((3, 1, 1), (3.0, 1.0, 1.0), "tetrahedron")
+    arm = body.points[body.node_sets["tip"], 1:] - 0.5
+    c, s = np.cos(3.0), np.sin(3.0)
+    turned = np.column_stack([-np.ones(len(arm)), arm @ np.array([[c, s], [-s, c]]) - arm])
+    with Problem(body, NeoHookean(1.0, 0.3), held={"fixed": "xyz", "tip": "xyz"}) as problem:
+        assert problem.solve(Loading(displacement={"tip": turned})).load_steps > 1
+
+
+def test_rounding_ends_a_linear_problem_that_is_nearly_incompressible() -> None:
+    """The residual cannot fall below the rounding of strains: that is the solution, and no failure."""
+    body = beam((6, 3, 3), (48.0, 16.0, 16.0), "hexahedron").quadratic()
+    with Problem(body, LinearElastic(1.0, 0.499999)) as problem:
+        forces = tip_force(body, 1e-6)
+        state = problem.solve(forces)
+        assert state.residual > problem.options.tolerance * np.linalg.norm(forces) and state.iterations < 8
+        linear = problem.apply_inverse(forces.ravel()).reshape(-1, 3)
+        np.testing.assert_allclose(state.displacement, linear, atol=1e-5 * np.abs(linear).max())
+
+
+def test_a_limit_point_is_said_to_be_one() -> None:
+    """A shallow arch under a dead load snaps through; past its top there is no more load to add in small steps."""
+    x = np.linspace(0.0, 1.0, 13)
+    rise = 0.06 * np.sin(np.pi * x)
+    points = np.concatenate([np.column_stack([x, rise]), np.column_stack([x, rise + 0.03])])
+    left = np.arange(12)
+    cells = np.column_stack([left, left + 1, left + 14, left + 13])
+    arch = Body(points, cells, {"fixed": np.array([0, 12, 13, 25])})
+    forces = np.zeros_like(points)
+    forces[19] = [0.0, -4.0]
+    with Problem(arch, NeoHookean(5000.0, 0.3), NewtonOptions(search="full", first_step=0.1)) as problem:
+        try:
+            state = problem.solve(forces)
+        except NotConverged as error:
+            assert "limit point" in str(error) and 0.1 < error.load_factor < 1.0
+            assert error.last is not None and error.last.is_stable
+        else:
+            assert state.displacement[19, 1] < -0.06  # it found its way to the other side
