@@ -72,11 +72,18 @@ def band_order(matrix: Any, points: Floats, nodes: Ints) -> Ints | None:
     size, dimension = len(indptr) - 1, points.shape[1]
     pattern = csr_matrix((np.ones(len(columns), dtype=np.int8), columns, indptr), shape=(size, size))
     centred = points[nodes] - points[nodes].mean(axis=0)
-    axis = np.linalg.svd(centred, full_matrices=False)[2][0]
-    blocks = np.argsort(centred @ axis, kind="stable")
-    along = (dimension * blocks[:, None] + np.arange(dimension)).ravel()
-    order = min((along, reverse_cuthill_mckee(pattern, True).astype(np.int64)), key=lambda o: _bandwidth(pattern, o))
+    orders = [reverse_cuthill_mckee(pattern, True).astype(np.int64)]
+    for axes in (np.linalg.svd(centred, full_matrices=False)[2], np.eye(dimension)):
+        blocks = _layers(centred @ axes.T)
+        orders.append((dimension * blocks[:, None] + np.arange(dimension)).ravel())
+    order = min(orders, key=lambda o: _bandwidth(pattern, o))
     return order if _bandwidth(pattern, order) <= _WIDEST * np.sqrt(size) else None
+
+
+def _layers(positions: Floats) -> Ints:
+    """Numbers of points sorted along the longest axis, then the next; rounded, so that layers stay layers."""
+    rounded = np.rint(positions / (1e-6 * np.ptp(positions, axis=0).max()))
+    return np.lexsort(rounded[:, np.argsort(np.ptp(positions, axis=0))].T)
 
 
 def _bandwidth(pattern: csr_matrix, order: Ints) -> int:
