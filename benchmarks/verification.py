@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 from verification_cases import PLANE, QUADRATIC, SPACE, compressible, incompressible
 from verification_derivatives import STEPS, frame, tangent, taylor, taylor_cases
 from verification_published import LOAD, YOUNG_MODULUS, cook, cook_tables, cooks, locking, slender_limit
+from verification_recorded import recorded_pages
 from verification_solutions import (
     SHEAR,
     STRETCH,
@@ -44,7 +45,8 @@ differences, figures that others publish. Every figure on this page was printed 
 
     python benchmarks/verification.py
 
-which writes this page and `benchmarks/results/verification.json` (with machine and versions).
+which writes this page and `benchmarks/results/verification.json` (with machine and versions); the last three sections
+are the records of scripts that they name.
 `tests/reference/test_verification.py` calls the same functions at small sizes and asserts what stands here.
 Statics only: dynamics is out of scope. Verification only: whether a material describes an organ is another question.
 
@@ -443,7 +445,7 @@ def main() -> None:
         return
     write("verification", figures)
     draw_locking(figures["locking"], DOCS / "verification-locking.png")
-    (DOCS / "verification.md").write_text("\n".join([INTRODUCTION, *sections]))
+    (DOCS / "verification.md").write_text("\n".join([INTRODUCTION, *sections, *recorded_pages()]))
 
 
 if __name__ == "__main__":
