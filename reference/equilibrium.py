@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 _GROWTH, _CUT = 1.5, 0.5  # of load steps after a success and a failure
 _FIRST_STEP = 0.25  # of the load where the whole load has failed
 _SMALLEST_STEP = 1e-6  # of the load; where not even that can be added there is a limit point
+_SHARES = (1.0, 0.5, 0.25)  # of the load whose linear response is warped for a start
 _LOST = 1e-12  # relative force on held nodes that may be round-off
 
 
@@ -193,7 +194,7 @@ class Problem:
             start = self._unknowns(guess, "guess")
             start[fixed] = load.lift[fixed]
             yield start
-        yield self._no_worse_than_rest(self._first_guess(load), load)
+        yield self._first_guess(load)
         if not self._has_lift(load):
             yield np.zeros_like(load.dead)
 
@@ -206,7 +207,25 @@ class Problem:
             return linear
         if self._space.mixed:
             return self._extended(load)
-        return self._warped(linear, load)
+        if self._has_lift(load):
+            return self._warped(linear, load)
+        return self._lowest(linear, load)
+
+    def _lowest(self, linear: Floats, load: Load) -> Floats:
+        """Of rest and the warped responses to parts of the load, the one of least energy.
+
+        Under the whole load of the liver's tools the response strains the cells beside them so much that its energy is
+        above that of rest; the response to a quarter or a half still saves two thirds of the factorisations.
+        """
+        best, lowest = np.zeros_like(linear), 0.0
+        for share in _SHARES:
+            start = self._warped(share * linear, load)
+            energy = self._forms.potential(start, load) - self._forms.pressure_work(np.zeros_like(start), start, load)
+            if energy < lowest:
+                best, lowest = start, energy
+            elif lowest < 0.0:
+                break
+        return best
 
     def _linear_response(self, load: Load) -> Floats:
         """K(0)^-1 of the dead forces, with prescribed displacements in their place."""
@@ -257,15 +276,6 @@ class Problem:
         matrix = create_matrix(laplacian)
         assemble(matrix, laplacian, space.conditions)
         self._poisson = LinearSolver(matrix, space, self._newton.linear.method, turns=False)
-
-    def _no_worse_than_rest(self, start: Floats, load: Load) -> Floats:
-        if self._has_lift(load) or self.material.is_linear or self._space.mixed:
-            return start
-        for scale in (1.0, 0.5, 0.25):
-            reached = self._forms.potential(scale * start, load)
-            if reached - self._forms.pressure_work(np.zeros_like(start), scale * start, load) <= 0.0:
-                return scale * start
-        return np.zeros_like(start)
 
     def _solve_in_steps(self, load: Load, spent: int, stability: bool, trace: bool) -> Equilibrium:
         reached, good = 0.0, 0
