@@ -74,7 +74,7 @@ class Problem:
                 f"Problem.body: expected quadratic cells for {type(material).__name__} (Taylor-Hood needs a "
                 f"displacement one degree above the pressure), got {body.kind.name}; body.quadratic() makes them."
             )
-        everything = {"xyz"[: body.dimension]}.pop()
+        everything = "xyz"[: body.dimension]
         self.held = dict(held) if held is not None else ({"fixed": everything} if "fixed" in body.node_sets else {})
         self._space = Discretisation(body, material.is_mixed, self.held, comm)
         checked = None if weights is None else _checked_weights(weights, len(body.cells))

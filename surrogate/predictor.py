@@ -19,6 +19,7 @@ from safetensors.numpy import save as save_tensors
 
 from softtwin.meshes.body import Body
 from softtwin.reference.dataset import LinearResponse
+from softtwin.reference.loading import checked_array
 
 from .mlp import PerceptronCore
 from .reduced import ReducedCore
@@ -131,7 +132,7 @@ class Surrogate:
             ValueError: another shape, numbers that are not finite, or forces at nodes that the surrogate never saw
                 loaded. Forces at fixed nodes move nothing and are let pass.
         """
-        load = self._checked("forces", forces, self.body.points.shape)
+        load = checked_array("Surrogate.forces", forces, self.body.points.shape)
         self._refuse_idle("forces", np.abs(load).max(axis=1))
         loads = load.ravel()[self._loaded]
         values, self._record = self.core.evaluate(self.frame.encode @ loads)
@@ -147,7 +148,7 @@ class Surrogate:
         Raises:
             ValueError: another shape, or numbers that are not finite.
         """
-        flat = self._checked("cotangent", cotangent, self.body.points.shape).ravel()
+        flat = checked_array("Surrogate.cotangent", cotangent, self.body.points.shape).ravel()
         inner = self.core.pull(self._record, flat @ self.frame.decode)
         gradient = np.zeros_like(flat)
         gradient[self._loaded] = self.frame.linear_adjoint(flat) + inner @ self.frame.encode
@@ -187,20 +188,12 @@ class Surrogate:
         """The same surrogate with more entries in its card, for instance held-out errors."""
         return Surrogate(self.body, self.frame, self.core, {**self.card, **entries})
 
-    def _checked(self, name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-        array = np.asarray(values, dtype=np.float64)
-        if array.shape != shape:
-            raise ValueError(f"Surrogate.{name}: expected shape {shape}, got {array.shape}.")
-        if not np.isfinite(array).all():
-            raise ValueError(f"Surrogate.{name}: expected finite numbers, got NaN or infinity.")
-        return array
-
     def _checked_columns(self, name: str, columns: ArrayLike) -> Floats:
         array = np.asarray(columns, dtype=np.float64)
         expected = self.body.points.size
         if array.ndim != 2 or array.shape[0] != expected:
             raise ValueError(f"Surrogate.{name}: expected shape ({expected}, k), got {array.shape}.")
-        self._checked(name, array, array.shape)
+        checked_array(f"Surrogate.{name}", array, array.shape)
         self._refuse_idle(name, np.abs(array).reshape(-1, 3 * array.shape[1]).max(axis=1, initial=0.0))
         return array
 
