@@ -127,8 +127,12 @@ class Discretisation:
 
     def field(self, unknowns: Floats) -> Floats:
         """Unknowns as a nodal field (n, 3), whole on every rank."""
+        return self.nodal(unknowns[self.own_numbers])
+
+    def nodal(self, own: Floats) -> Floats:
+        """Components of this rank, block by block, as a nodal field (n, 3), whole on every rank."""
         whole = np.empty_like(self.body.points)
-        whole[self._all_nodes] = self._gathered(unknowns[self.own_numbers].reshape(-1, self.body.dimension))
+        whole[self._all_nodes] = self._gathered(own.reshape(-1, self.body.dimension))
         return whole
 
     def pressure(self, unknowns: Floats) -> Floats | None:

@@ -68,6 +68,8 @@ class Forms:
         self.weights = 1 if weights is None else space.cell_function(weights, "Problem.weights")
         self._vector = ghosted_vector(space.space)
         self._surfaces: dict[str, _SurfaceForms] = {}
+        self.body_force = fem.Constant(space.mesh, np.zeros(space.body.dimension))
+        self._body_force_form: Any = None
         self.direction = fem.Function(space.space)
         self.derivatives: Any = None  # what sensitivity.py compiles, kept here from equilibrium to equilibrium
         self._compile()
@@ -130,7 +132,7 @@ class Forms:
         if loading.forces is not None:
             dead += space.unknowns("Problem.forces", loading.forces)
         if loading.body_force is not None:
-            dead += self.assembled(self._body_force(np.asarray(loading.body_force)))
+            dead += self._body_forces(np.asarray(loading.body_force))
         for surface, traction in loading.traction.items():
             forms = self.surface(surface)
             forms.traction.value[:] = traction
@@ -143,9 +145,12 @@ class Forms:
         lift[space.fixed] = everywhere[space.fixed]
         return Load(dead, lift, {name: value for name, value in loading.pressure.items() if value != 0.0})
 
-    def _body_force(self, force: Floats) -> Any:
-        v, _ = self._test()
-        return form(self.weights * ufl.inner(fem.Constant(self.space.mesh, force), v) * self.dx)
+    def _body_forces(self, force: Floats) -> Floats:
+        if self._body_force_form is None:
+            v, _ = self._test()
+            self._body_force_form = form(self.weights * ufl.inner(self.body_force, v) * self.dx)
+        self.body_force.value[:] = force
+        return self.assembled(self._body_force_form)
 
     def _test(self) -> tuple[Any, Any]:
         return ufl.TestFunctions(self.space.space) if self.space.mixed else (ufl.TestFunction(self.space.space), None)

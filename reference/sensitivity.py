@@ -401,12 +401,9 @@ class _Derivatives:
             parts.append(self._form(key, lambda pulled=pulled: ufl.derivative(pulled, self._shape, shape_test)))
         vector = ghosted_vector(space.displacements)
         assemble_vector(vector, parts)
-        dimension = space.body.dimension
-        own = np.array(vector.array_r).reshape(-1, dimension)
+        found = space.nodal(np.array(vector.array_r))
         vector.destroy()
-        whole = np.empty_like(space.body.points)
-        whole[space._all_nodes] = space._gathered(own)
-        return -whole
+        return -found
 
     def _moved(self) -> tuple[Any, Any]:
         """G = I + grad V, and F = I + grad u G^-1."""
@@ -428,9 +425,8 @@ class _Derivatives:
         G, _ = self._moved()
         found: list[tuple[Any, Any, Any, Any]] = []
         if loading.body_force is not None:
-            force = self._constant("body force")
-            pulled = -forms.weights * ufl.inner(force, a) * ufl.det(G) * forms.dx
-            found.append(("X b", pulled, force, loading.body_force))
+            pulled = -forms.weights * ufl.inner(forms.body_force, a) * ufl.det(G) * forms.dx
+            found.append(("X b", pulled, forms.body_force, loading.body_force))
         for name, traction in loading.traction.items():
             surface = forms.surface(name)
             area = deformed_area(space, u, G)
@@ -442,11 +438,6 @@ class _Derivatives:
             pulled = surface.pressure * ufl.inner(deformed_area(space, u, total), a) * surface.ds
             found.append((("X p", name), pulled, surface.pressure, pascals))
         return found
-
-    def _constant(self, name: str) -> Any:
-        if name not in self._compiled:
-            self._compiled[name] = fem.Constant(self.space.mesh, np.zeros(self.space.body.dimension))
-        return self._compiled[name]
 
 
 def _cell_test(function: Any) -> Any:
