@@ -84,7 +84,7 @@ def main(count: int = 1000) -> None:
     ways: dict[str, tuple[dict[str, Any], dict[str, Any], int]] = {
         "softtwin": ({}, {}, count),
         "full steps from rest": ({"search": "full", "chord": False}, {"guess": rest, "fallback": False}, COMPARED),
-        "energy search from rest": ({"chord": False}, {"guess": rest, "fallback": False}, count),
+        "energy search from rest": ({"chord": False, "elimination": False}, {"guess": rest, "fallback": False}, count),
         "full steps in load steps": ({"search": "full", "chord": False, "first_step": 0.25}, {}, COMPARED),
         **{
             f"PETSc {name} from rest": ({"search": name, "chord": False}, {"guess": rest, "fallback": False}, COMPARED)

@@ -328,6 +328,7 @@ class Problem:
             negative_pivots=self._negative_pivots(unknowns, load) if stability else None,
             pressure=self._space.pressure(unknowns),
             trace=lines,
+            local_iterations=self._newton.local_iterations,
         )
 
     # ------------------------------------------------------------------ the tangent at a state

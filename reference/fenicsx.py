@@ -25,6 +25,7 @@ from mpi4py import MPI  # before PETSc, which would start MPI without the thread
 # PETSc's own handler turns SIGTERM and SIGPIPE into MPI_Abort; Python's must stay.
 petsc4py.init(["softtwin", "-no_signal_handler"])
 
+import cffi
 import dolfinx
 import numpy as np
 import ufl
@@ -38,6 +39,7 @@ from softtwin.meshes.elements import Kind
 
 __all__ = [
     "MPI",
+    "CellMatrices",
     "PETSc",
     "add_matrix",
     "assemble_matrix",
@@ -266,6 +268,43 @@ def form(expression: Any) -> Any:
         with _compiling(cache):
             ffcx_jit(MPI.COMM_SELF, expression, {"scalar_type": PETSc.ScalarType if new else "double"}, jit)
         return fem.form(expression, **{"jit_options" if new else "jit_params": jit})
+
+
+class CellMatrices:
+    """The matrices of a bilinear form on some cells, where assembling all of them would be too much.
+
+    Args:
+        compiled: a form with one integral, over cells, whose elements need no orientation (Lagrange of degree 1 or 2).
+        space: of both its arguments, on one rank.
+    """
+
+    def __init__(self, compiled: Any, space: Any) -> None:
+        self._compiled, self._ffi = compiled, cffi.FFI()
+        ufcx = compiled.ufcx_form
+        integral = ufcx.form_integrals[0] if hasattr(ufcx, "form_integrals") else ufcx.integrals(0)[0]
+        self._kernel = integral.tabulate_tensor_float64
+        # After A, w, c and x come the facet and its orientation, later also custom data: nothing of it is for cells.
+        self._absent = [self._ffi.NULL] * (len(self._ffi.typeof(self._kernel).args) - 4)
+        domain = space.mesh
+        self._points = domain.geometry.x[_table(domain.geometry.dofmap, local_cells(domain))]
+        self._unknowns = cell_dofs(space).shape[1] * space.dofmap.index_map_bs
+
+    def __call__(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Matrices of local cells at the present coefficients, (cells, k, k).
+
+        Rows and columns are in the order of `cell_dofs`, all components of a block together.
+        """
+        (coefficients,) = fem.assemble.pack_coefficients(self._compiled).values()
+        numbers = np.ascontiguousarray(fem.assemble.pack_constants(self._compiled))
+        values = np.ascontiguousarray(coefficients[cells])
+        points = np.ascontiguousarray(self._points[cells])
+        out = np.zeros((len(cells), self._unknowns, self._unknowns))
+        to, w, c, x = (self._ffi.cast("double *", array.ctypes.data) for array in (out, values, numbers, points))
+        kernel, absent = self._kernel, self._absent
+        steps = [array[0].size if len(cells) else 0 for array in (out, values, points)]
+        for cell in range(len(cells)):
+            kernel(to + cell * steps[0], w + cell * steps[1], c, x + cell * steps[2], *absent)
+        return out
 
 
 def dirichlet(space: Any, domain: Any, unknowns: list[NDArray[np.int64]], mixed: bool) -> list[Any]:

@@ -119,7 +119,7 @@ class Forms:
         tangent = ufl.derivative(residual, self.space.state, ufl.TrialFunction(self.space.space))
         self._energy = form(guarded * self.dx)
         self._residual = form(residual)
-        self._tangent = form(tangent)
+        self.tangent_form = form(tangent)
         self._tangent_action: Any = None
         self._tangent_expression = tangent
 
@@ -192,7 +192,7 @@ class Forms:
     def tangent(self, unknowns: Floats, load: Load, matrix: Any) -> None:
         """The derivative of the residual into a matrix; held rows and columns are the identity's."""
         self.space.set_state(unknowns)
-        assemble_matrix(matrix, self._tangent, self.space.conditions)
+        assemble_matrix(matrix, self.tangent_form, self.space.conditions)
         for surface in self._pressed(load):
             add_matrix(matrix, facet_matrix(surface.pressure_tangent, self.space.fixed))
 
@@ -268,7 +268,7 @@ class Forms:
 
     def create_matrix(self) -> Any:
         """A matrix with the tangent's sparsity."""
-        return create_matrix(self._tangent)
+        return create_matrix(self.tangent_form)
 
     def stiffness_scale(self) -> float:
         """The modulus that resists stretching at rest, pascals: v K(0) v / volume for the field v = (x, 0, 0)."""

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .elimination import CellElimination
 from .fenicsx import PETSc
 from .forms import Forms, Load
 from .linear import METHODS, LinearSolver, Method, chosen_method
@@ -24,6 +25,8 @@ _ARMIJO = 1e-4
 _SMALLEST_STEP = 1e-8
 _ROUND_OFF = 1e-12  # of the energy: differences below it say nothing about descent
 _EPSILONS = 8.0  # of machine precision in sums of stresses and energies that cancel
+_CUT_STEP = 0.5  # a shorter one calls for elimination
+_LOCAL_STEPS, _LOCAL_TOLERANCE = 15, 0.1
 _CHORD_STEPS = 8  # with a kept factorisation cost as much as a new one and its iteration
 _prefixes = itertools.count()
 
@@ -40,6 +43,8 @@ class NewtonOptions:
             only where a cell would be inside out; PETSc's `bt`, `l2`, `cp` on the residual. A mixed problem has no
             energy to decrease and takes `full` steps for `energy`.
         first_step: part of the load that is tried first; 1 tries the whole load at once, and steps only if that fails.
+        elimination: where the energy's search cuts a step by more than half, balance the cells most out of balance
+            alone before the next (on one rank).
         chord: keep a factorisation while it converges fast; False factors in each iteration.
         linear: `band` (LAPACK, for slender bodies; MUMPS for others), `mumps`, `multigrid` (conjugate gradients with
             smoothed aggregation), or `auto` by size and shape.
@@ -50,6 +55,7 @@ class NewtonOptions:
     max_load_steps: int = 100
     search: Search = "energy"
     first_step: float = 1.0
+    elimination: bool = True
     chord: bool = True
     linear: Method = "auto"
 
@@ -99,6 +105,7 @@ class Newton:
         self.matrix = forms.create_matrix()
         self._residual, self._x = self.matrix.createVecLeft(), self.matrix.createVecRight()
         self._snes: Any = None
+        self._local: CellElimination | None = None
         self.linear: LinearSolver
         self.factored_at: tuple[Floats, dict[str, float]] | None = None
         rest = np.zeros(self.space.owned)
@@ -154,7 +161,7 @@ class Newton:
 
     def start_count(self) -> None:
         """Forget the counts and the trace of the last solve."""
-        self.factorisations = 0
+        self.factorisations = self.local_iterations = 0
         self.trace: list[Iteration] = []
 
     def run(self, load: Load, start: Floats, factor: float = 1.0) -> Attempt:
@@ -253,13 +260,35 @@ class Newton:
         if self.search == "full":
             self._length = self._admissible(unknowns, step)
         else:
-            slope = -self.space.dot(np.asarray(self._residual.array_r), step)  # SNES left the residual at x in there
-            if slope > 0.0:  # an indefinite tangent may point uphill
-                step, slope = -step, -slope
-            self._length = self._armijo(unknowns, step, slope)
+            self._length = self._downhill(unknowns, step, np.asarray(self._residual.array_r))  # SNES left it in there
         self._search_failed = self._length == 0.0
         y.array[:] = self._length * step
+        if 0.0 < abs(self._length) < _CUT_STEP and self._eliminates:
+            y.array[:] = unknowns - self._eliminated(unknowns - self._length * step)
         return True
+
+    @property
+    def _eliminates(self) -> bool:
+        return self.options.elimination and self.search == "energy" and self.space.comm.size == 1
+
+    def _eliminated(self, unknowns: Floats) -> Floats:
+        """Unknowns at which the cells most out of balance are in balance with the others where they are."""
+        if self._local is None:
+            self._local = CellElimination(self.space, self.forms.tangent_form)
+        residual = self._free_residual(unknowns)
+        patch = self._local.around(residual)
+        enough = _LOCAL_TOLERANCE * np.linalg.norm(residual[patch.unknowns])
+        for _ in range(_LOCAL_STEPS):
+            step = patch.step(unknowns, residual)
+            length = self._downhill(unknowns, step, residual)
+            if length == 0.0:
+                break
+            unknowns = unknowns - length * step
+            self.local_iterations += 1
+            residual = self._free_residual(unknowns)
+            if np.linalg.norm(residual[patch.unknowns]) <= enough:
+                break
+        return unknowns
 
     def _admissible(self, unknowns: Floats, step: Floats) -> float:
         length = 1.0
@@ -268,6 +297,20 @@ class Newton:
                 return length
             length /= 2.0
         return 0.0
+
+    def _downhill(self, unknowns: Floats, step: Floats, residual: Floats) -> float:
+        """How much of a step lowers the energy enough: less than nothing where an indefinite tangent points uphill."""
+        if not self.space.dot(step, step) < np.inf:
+            return 0.0
+        slope = -self.space.dot(residual, step)
+        if slope > 0.0:
+            return -self._armijo(unknowns, -step, -slope)
+        return self._armijo(unknowns, step, slope)
+
+    def _free_residual(self, unknowns: Floats) -> Floats:
+        residual = self.forms.residual(unknowns, self._load)
+        residual[self.space.fixed] = 0.0
+        return residual
 
     def _armijo(self, unknowns: Floats, step: Floats, slope: float) -> float:
         """Armijo's rule on the energy with quadratic interpolation; a step that turns a cell inside out is refused."""

@@ -19,7 +19,7 @@ class Iteration:
         iteration: number within the load step; 0 is its start.
         residual: norm of the out-of-balance forces, newtons.
         potential: strain energy minus work of dead forces, joules; None where the search did not need it.
-        length: of the step that led here, relative to Newton's.
+        length: of the step that led here, relative to Newton's; negative where an indefinite tangent had to be turned.
         factorisations: tangents factored so far.
     """
 
@@ -48,6 +48,7 @@ class Equilibrium:
             eliminated): 0 is a stable state, None was not asked for or is not known (multigrid, L U).
         pressure: (n,), pascals, positive in compression, where it is an unknown.
         trace: every iteration, where asked for.
+        local_iterations: Newton iterations of a few cells alone (nonlinear elimination), a tenth of the others' cost.
     """
 
     displacement: Floats
@@ -60,6 +61,7 @@ class Equilibrium:
     negative_pivots: int | None
     pressure: Floats | None = None
     trace: tuple[Iteration, ...] = ()
+    local_iterations: int = 0
 
     @property
     def is_stable(self) -> bool:

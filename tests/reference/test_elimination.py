@@ -1,0 +1,61 @@
+"""Nonlinear elimination: a few cells have the tangent of the whole, and a tool's load needs fewer of the whole."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+
+from scipy.sparse import csr_matrix
+from verification_cases import PLANE, SPACE, box
+
+from softtwin.reference.discretisation import Discretisation
+from softtwin.reference.elimination import CellElimination
+from softtwin.reference.equilibrium import NewtonOptions, Problem
+from softtwin.reference.forms import Forms, Load
+from softtwin.reference.materials import NeoHookean
+
+MATERIAL = NeoHookean(4500.0, 0.45)
+
+
+@pytest.mark.parametrize("kind", [*PLANE, *SPACE])
+def test_the_step_of_a_patch_solves_the_rows_of_the_whole_tangent(kind: str, rng: np.random.Generator) -> None:
+    body = box(kind, 4)
+    cells = len(body.cells)
+    space = Discretisation(body, False, {"x0": "xyz"[: body.dimension]})
+    forms = Forms(space, NeoHookean(rng.uniform(1e3, 5e3, cells), 0.45), rng.uniform(0.5, 1.0, cells))
+    unknowns = 0.01 * rng.standard_normal(space.owned)
+    unknowns[space.fixed] = 0.0
+    residual = rng.standard_normal(space.owned)
+    residual[space.fixed] = 0.0
+
+    elimination = CellElimination(space, forms.tangent_form)
+    patch = elimination.around(residual)
+    step = patch.step(unknowns, residual)
+
+    matrix = forms.create_matrix()
+    forms.tangent(unknowns, Load(residual, np.zeros_like(residual), {}), matrix)
+    indptr, columns, values = matrix.getValuesCSR()
+    rows = csr_matrix((values, columns, indptr))[patch.unknowns]
+    assert 0 < len(patch.unknowns) < space.owned - len(space.fixed)
+    assert not np.isin(space.fixed, patch.unknowns).any()
+    np.testing.assert_allclose(rows @ step, residual[patch.unknowns], rtol=0, atol=1e-9 * np.abs(residual).max())
+    assert not np.delete(step, patch.unknowns).any()
+
+
+def test_a_pull_at_one_node_takes_fewer_tangents_to_the_same_state() -> None:
+    body = box("tetra", 8)
+    forces = np.zeros_like(body.points)
+    pulled = np.argmin(np.linalg.norm(body.points - [1.0, 0.5, 1.0], axis=1))
+    forces[pulled] = [100.0, 0.0, 300.0]
+    found = {}
+    for elimination in (False, True):
+        with Problem(body, MATERIAL, NewtonOptions(elimination=elimination), held={"x0": "xyz"}) as problem:
+            found[elimination] = problem.solve(forces)
+    plain, helped = found[False], found[True]
+    assert plain.local_iterations == 0
+    assert helped.local_iterations > 0
+    assert helped.factorisations < plain.factorisations / 2
+    assert helped.is_stable and plain.is_stable
+    np.testing.assert_allclose(helped.displacement, plain.displacement, rtol=0, atol=1e-8)
