@@ -285,8 +285,9 @@ class CellMatrices:
         self._kernel = integral.tabulate_tensor_float64
         # After A, w, c and x come the facet and its orientation, later also custom data: nothing of it is for cells.
         self._absent = [self._ffi.NULL] * (len(self._ffi.typeof(self._kernel).args) - 4)
-        domain = space.mesh
-        self._points = domain.geometry.x[_table(domain.geometry.dofmap, local_cells(domain))]
+        geometry = space.mesh.geometry
+        numbers = geometry.dofmaps[0] if isinstance(getattr(geometry, "dofmaps", None), list) else geometry.dofmap
+        self._points = geometry.x[_table(numbers, local_cells(space.mesh))]
         self._unknowns = cell_dofs(space).shape[1] * space.dofmap.index_map_bs
 
     def __call__(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:

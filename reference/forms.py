@@ -71,6 +71,7 @@ class Forms:
         self.body_force = fem.Constant(space.mesh, np.zeros(space.body.dimension))
         self._body_force_form: Any = None
         self.direction = fem.Function(space.space)
+        self.reactions = np.zeros(len(space.fixed))  # at held unknowns, where the residual was last asked for
         self.derivatives: Any = None  # what sensitivity.py compiles, kept here from equilibrium to equilibrium
         self._compile()
 
@@ -181,6 +182,7 @@ class Forms:
         self.space.set_state(unknowns)
         out = self.assembled(self._residual, *(s.pressure_form for s in self._pressed(load))) - load.dead
         fixed = self.space.fixed
+        self.reactions = out[fixed]
         out[fixed] = unknowns[fixed] - load.lift[fixed]
         return out
 

@@ -36,7 +36,8 @@ class NewtonOptions:
     """How far, how long and in which way to iterate.
 
     Args:
-        tolerance: norm of the residual over free unknowns, relative to the norm of the forces.
+        tolerance: norm of the residual over free unknowns, relative to that of the forces (of following pressures at
+            rest; of the reactions too where supports are moved).
         max_iterations: Newton iterations of one load step.
         max_load_steps: load steps tried, failed ones included, before giving up.
         search: `energy`, Armijo's rule on the energy, which converges where the others do not; `full` steps, halved
@@ -187,19 +188,25 @@ class Newton:
         return Attempt(np.array(self._x.array_r), reason > 0, reason, iterations, residual)
 
     def _start_tolerance(self, load: Load) -> None:
-        scale = self.space.norm(load.dead)
-        if load.pressure or self.space.dot(load.lift, load.lift) > 0.0:
-            # Reactions and pressures are forces too: what holds the start's strains and surfaces in place.
-            lifted = self.forms.tangent_times(np.zeros(self.space.owned), load.lift)
+        self._scale = self.space.norm(load.dead)
+        if load.pressure:
             pressed = self.forms.residual(np.zeros(self.space.owned), load)
             pressed[self.space.fixed] = 0.0
-            scale = max(scale, self.space.norm(lifted), self.space.norm(pressed))
-        self._absolute_tolerance = max(float(self.options.tolerance * scale), self._round_off)
+            self._scale = max(self._scale, self.space.norm(pressed))
+        self._moves_supports = self.space.dot(load.lift, load.lift) > 0.0
+        self._absolute_tolerance = max(self.options.tolerance * self._scale, self._round_off)
+
+    def _count_reactions(self) -> None:
+        """Where supports are moved, the forces that they need are forces too."""
+        scale = max(self._scale, self.space.norm(self.forms.reactions))
+        self._absolute_tolerance = max(self.options.tolerance * scale, self._round_off)
 
     # ------------------------------------------------------------------ the four things SNES asks for
 
     def _function(self, snes: Any, x: Any, f: Any) -> None:
         values = self.forms.residual(np.array(x.array_r), self._load)
+        if self._moves_supports:
+            self._count_reactions()
         if self.search != "energy" and not np.isfinite(self.forms.energy(np.array(x.array_r))):
             values[:] = np.nan  # PETSc's searches shorten a step that leads there
         f.array[:] = values
