@@ -279,7 +279,8 @@ class CellMatrices:
     """
 
     def __init__(self, compiled: Any, space: Any) -> None:
-        self._compiled, self._ffi = compiled, cffi.FFI()
+        self._form = getattr(compiled, "_cpp_object", compiled)
+        self._ffi = cffi.FFI()
         ufcx = compiled.ufcx_form
         integral = ufcx.form_integrals[0] if hasattr(ufcx, "form_integrals") else ufcx.integrals(0)[0]
         self._kernel = integral.tabulate_tensor_float64
@@ -295,8 +296,8 @@ class CellMatrices:
 
         Rows and columns are in the order of `cell_dofs`, all components of a block together.
         """
-        (coefficients,) = fem.assemble.pack_coefficients(self._compiled).values()
-        numbers = np.ascontiguousarray(fem.assemble.pack_constants(self._compiled))
+        (coefficients,) = dolfinx.cpp.fem.pack_coefficients(self._form).values()
+        numbers = np.ascontiguousarray(dolfinx.cpp.fem.pack_constants(self._form))
         values = np.ascontiguousarray(coefficients[cells])
         points = np.ascontiguousarray(self._points[cells])
         out = np.zeros((len(cells), self._unknowns, self._unknowns))

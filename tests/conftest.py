@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 
 LIVER = Path(__file__).parents[2] / "shared" / "data" / "liver"
+
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 
@@ -28,6 +30,22 @@ def tetrahedral_beam() -> Body:
 @pytest.fixture(params=["hexahedral_beam", "tetrahedral_beam"])
 def any_beam(request: pytest.FixtureRequest) -> Body:
     return request.getfixturevalue(request.param)
+
+
+@pytest.fixture(scope="session")
+def mpi_environment() -> dict[str, str]:
+    """For mpirun: more ranks than cores, as root, in the words of Open MPI 4 and 5; MPICH asks for none of it."""
+    return {
+        **os.environ,
+        "OMPI_ALLOW_RUN_AS_ROOT": "1",
+        "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+        "OMPI_MCA_rmaps_base_oversubscribe": "1",
+        "OMPI_MCA_hwloc_base_binding_policy": "none",
+        "OMPI_MCA_mpi_yield_when_idle": "1",
+        "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
+        "PRTE_MCA_hwloc_default_binding_policy": "none",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
 
 
 @pytest.fixture

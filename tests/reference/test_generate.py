@@ -59,15 +59,7 @@ def assert_same(first: DataSet, second: DataSet) -> None:
         assert values.size and np.array_equal(values, other[name]), name
 
 
-def start(path: Path, ranks: int) -> subprocess.Popen:
-    environment = {
-        **os.environ,
-        "OMPI_ALLOW_RUN_AS_ROOT": "1",
-        "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMPI_MCA_rmaps_base_oversubscribe": "1",
-        "OMPI_MCA_hwloc_base_binding_policy": "none",
-    }
+def start(path: Path, ranks: int, environment: dict[str, str]) -> subprocess.Popen:
     launch = [] if ranks == 1 else ["mpirun", "-n", str(ranks)]
     return subprocess.Popen(
         [*launch, sys.executable, "-c", PROGRAM, str(path)], env=environment, start_new_session=True
@@ -116,24 +108,23 @@ def test_splits_share_no_draw(undisturbed: DataSet) -> None:
 @pytest.mark.mpi
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="mpirun is absent")
 @pytest.mark.parametrize("ranks", [2, 3])
-def test_ranks_do_not_change_the_data(undisturbed: DataSet, tmp_path: Path, ranks: int) -> None:
-    assert start(tmp_path / "data.zarr", ranks).wait(timeout=120) == 0
+def test_ranks_do_not_change_the_data(
+    undisturbed: DataSet, tmp_path: Path, mpi_environment: dict[str, str], ranks: int
+) -> None:
+    assert start(tmp_path / "data.zarr", ranks, mpi_environment).wait(timeout=120) == 0
     assert_same(undisturbed, DataSet(tmp_path / "data.zarr"))
 
 
 @pytest.mark.mpi
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="mpirun is absent")
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_kill_9_loses_only_what_was_under_way(undisturbed: DataSet, tmp_path: Path, ranks: int) -> None:
+def test_kill_9_loses_only_what_was_under_way(
+    undisturbed: DataSet, tmp_path: Path, mpi_environment: dict[str, str], ranks: int
+) -> None:
     path = tmp_path / "data.zarr"
     kills = 0
-    for delay in (
-        0.0,
-        0.05,
-        0.1,
-        0.15,
-    ):  # after the first block, so that a kill falls into different moments of the work
-        process = start(path, ranks)
+    for delay in (0.0, 0.05, 0.1, 0.15):  # after the first block: a kill falls into different moments of the work
+        process = start(path, ranks, mpi_environment)
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline and process.poll() is None and not _blocks(path):
             time.sleep(0.005)
@@ -153,9 +144,9 @@ def _blocks(path: Path) -> int:
 
 
 @pytest.mark.mpi
-def test_ctrl_c_leaves_whole_blocks(undisturbed: DataSet, tmp_path: Path) -> None:
+def test_ctrl_c_leaves_whole_blocks(undisturbed: DataSet, tmp_path: Path, mpi_environment: dict[str, str]) -> None:
     path = tmp_path / "data.zarr"
-    process = start(path, 1)
+    process = start(path, 1, mpi_environment)
     while process.poll() is None and not _blocks(path):
         time.sleep(0.005)
     process.send_signal(signal.SIGINT)

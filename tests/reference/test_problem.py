@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -320,18 +319,15 @@ if comm.rank == 0:
 
 @pytest.mark.mpi
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="mpirun is absent")
-def test_ranks_that_share_a_mesh_find_the_same(tmp_path: Path) -> None:
-    environment = {
-        **os.environ,
-        **{"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OPENBLAS_NUM_THREADS": "1"},
-        **{"OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_hwloc_base_binding_policy": "none"},
-        "OMPI_MCA_mpi_yield_when_idle": "1",
-    }
+def test_ranks_that_share_a_mesh_find_the_same(tmp_path: Path, mpi_environment: dict[str, str]) -> None:
     found = []
     for ranks in (1, 3):
         path = tmp_path / f"{ranks}.npz"
         subprocess.run(
-            ["mpirun", "-n", str(ranks), sys.executable, "-c", PARALLEL, path], env=environment, check=True, timeout=300
+            ["mpirun", "-n", str(ranks), sys.executable, "-c", PARALLEL, path],
+            env=mpi_environment,
+            check=True,
+            timeout=300,
         )
         found.append(dict(np.load(path)))
     one, three = found
