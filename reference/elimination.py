@@ -7,8 +7,6 @@ Newton goes on with whole steps. Gong and Cai (SIAM J. Sci. Comput. 41, 2019) do
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -28,12 +26,11 @@ class CellElimination:
 
     Args:
         space: numbering of a displacement alone, on one rank.
-        tangent: compiled second derivative of the strain energy.
+        matrices: second derivatives of the strain energy.
     """
 
-    def __init__(self, space: Discretisation, tangent: Any) -> None:
-        self.space = space
-        self._matrices = CellMatrices(tangent, space.space)
+    def __init__(self, space: Discretisation, matrices: CellMatrices) -> None:
+        self.space, self._matrices = space, matrices
         self._blocks = cell_dofs(space.space)
         self._count = min(int(np.ceil(_SHARE * len(space.body.points))), _MOST)
         self._free = np.ones(space.owned, dtype=bool)
@@ -51,7 +48,7 @@ class CellElimination:
     def matrices(self, unknowns: Floats, cells: Ints) -> Floats:
         """Tangents of some cells at a state."""
         self.space.set_state(unknowns)
-        return self._matrices(cells)
+        return self._matrices.some(cells)
 
 
 class Patch:

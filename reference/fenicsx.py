@@ -60,9 +60,11 @@ __all__ = [
     "form",
     "ghosted_vector",
     "local_cells",
+    "matrix_of",
     "original_cells",
     "quiet_jit",
     "scalar",
+    "sparsity",
     "taylor_hood_space",
     "ufl",
     "vector_space",
@@ -271,7 +273,7 @@ def form(expression: Any) -> Any:
 
 
 class CellMatrices:
-    """The matrices of a bilinear form on some cells, where assembling all of them would be too much.
+    """The matrices of a bilinear form on each cell, before they are added up.
 
     Args:
         compiled: a form with one integral, over cells, whose elements need no orientation (Lagrange of degree 1 or 2).
@@ -289,24 +291,37 @@ class CellMatrices:
         geometry = space.mesh.geometry
         numbers = geometry.dofmaps[0] if isinstance(getattr(geometry, "dofmaps", None), list) else geometry.dofmap
         self._points = geometry.x[_table(numbers, local_cells(space.mesh))]
-        self._unknowns = cell_dofs(space).shape[1] * space.dofmap.index_map_bs
+        unknowns = cell_dofs(space).shape[1] * space.dofmap.index_map_bs
+        self._all: NDArray[np.float64] = np.empty((0, unknowns, unknowns))
 
-    def __call__(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    def some(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
         """Matrices of local cells at the present coefficients, (cells, k, k).
 
         Rows and columns are in the order of `cell_dofs`, all components of a block together.
         """
-        (coefficients,) = dolfinx.cpp.fem.pack_coefficients(self._form).values()
+        out = np.zeros((len(cells), *self._all.shape[1:]))
+        self._tabulate(out, np.ascontiguousarray(self._coefficients()[cells]), self._points[cells])
+        return out
+
+    def all(self) -> NDArray[np.float64]:
+        """Matrices of all local cells; the next call overwrites them."""
+        if not len(self._all):
+            self._all = np.empty((len(self._points), *self._all.shape[1:]))
+        self._all.fill(0.0)
+        self._tabulate(self._all, self._coefficients(), self._points)
+        return self._all
+
+    def _coefficients(self) -> Any:
+        (values,) = dolfinx.cpp.fem.pack_coefficients(self._form).values()
+        return values
+
+    def _tabulate(self, out: Any, values: Any, points: Any) -> None:
         numbers = np.ascontiguousarray(dolfinx.cpp.fem.pack_constants(self._form))
-        values = np.ascontiguousarray(coefficients[cells])
-        points = np.ascontiguousarray(self._points[cells])
-        out = np.zeros((len(cells), self._unknowns, self._unknowns))
         to, w, c, x = (self._ffi.cast("double *", array.ctypes.data) for array in (out, values, numbers, points))
         kernel, absent = self._kernel, self._absent
-        steps = [array[0].size if len(cells) else 0 for array in (out, values, points)]
-        for cell in range(len(cells)):
-            kernel(to + cell * steps[0], w + cell * steps[1], c, x + cell * steps[2], *absent)
-        return out
+        entries, coefficients, coordinates = (array[:1].size for array in (out, values, points))
+        for cell in range(len(out)):
+            kernel(to + cell * entries, w + cell * coefficients, c, x + cell * coordinates, *absent)
 
 
 def dirichlet(space: Any, domain: Any, unknowns: list[NDArray[np.int64]], mixed: bool) -> list[Any]:
@@ -327,6 +342,23 @@ def _any(comm: Any, count: int) -> bool:
 def create_matrix(compiled: Any) -> Any:
     """A PETSc matrix with the sparsity of a bilinear form."""
     return fem_petsc.create_matrix(compiled)
+
+
+def sparsity(compiled: Any) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows' starts and columns of a bilinear form's matrix, on one rank."""
+    matrix = create_matrix(compiled)
+    assemble_matrix(matrix, compiled, [])  # what is not inserted is dropped
+    starts, columns, _ = matrix.getValuesCSR()
+    matrix.destroy()
+    return starts, columns
+
+
+def matrix_of(starts: NDArray[np.int64], columns: NDArray[np.int64]) -> Any:
+    """A PETSc matrix on one rank over a NumPy array, its attribute `values`; who writes there calls `stateIncrease`."""
+    values, size = np.zeros(len(columns)), len(starts) - 1
+    matrix = PETSc.Mat().createAIJWithArrays((size, size), (starts, columns, values), comm=MPI.COMM_SELF)
+    matrix.setAttr("values", values)
+    return matrix
 
 
 def assemble_matrix(matrix: Any, compiled: Any, conditions: list[Any]) -> None:

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .assembly import CellSum, suits
 from .discretisation import Discretisation, quadrature_degree
 from .fenicsx import (
+    CellMatrices,
     add_matrix,
     assemble_matrix,
     assemble_vector,
@@ -21,6 +23,7 @@ from .fenicsx import (
     form,
     ghosted_vector,
     scalar,
+    sparsity,
     ufl,
 )
 from .loading import Loading
@@ -121,6 +124,11 @@ class Forms:
         self._energy = form(guarded * self.dx)
         self._residual = form(residual)
         self.tangent_form = form(tangent)
+        self._cell_sum: CellSum | None = None
+        if self.space.comm.size == 1:
+            self.cells = CellMatrices(self.tangent_form, self.space.space)
+        if suits(self.space):
+            self._cell_sum = CellSum(self.space, self.cells, sparsity(self.tangent_form))
         self._tangent_action: Any = None
         self._tangent_expression = tangent
 
@@ -194,7 +202,10 @@ class Forms:
     def tangent(self, unknowns: Floats, load: Load, matrix: Any) -> None:
         """The derivative of the residual into a matrix; held rows and columns are the identity's."""
         self.space.set_state(unknowns)
-        assemble_matrix(matrix, self.tangent_form, self.space.conditions)
+        if self._cell_sum is None:
+            assemble_matrix(matrix, self.tangent_form, self.space.conditions)
+        else:
+            self._cell_sum.assemble(matrix)
         for surface in self._pressed(load):
             add_matrix(matrix, facet_matrix(surface.pressure_tangent, self.space.fixed))
 
@@ -270,7 +281,7 @@ class Forms:
 
     def create_matrix(self) -> Any:
         """A matrix with the tangent's sparsity."""
-        return create_matrix(self.tangent_form)
+        return create_matrix(self.tangent_form) if self._cell_sum is None else self._cell_sum.create_matrix()
 
     def stiffness_scale(self) -> float:
         """The modulus that resists stretching at rest, pascals: v K(0) v / volume for the field v = (x, 0, 0)."""

@@ -281,7 +281,7 @@ class Newton:
     def _eliminated(self, unknowns: Floats) -> Floats:
         """Unknowns at which the cells most out of balance are in balance with the others where they are."""
         if self._local is None:
-            self._local = CellElimination(self.space, self.forms.tangent_form)
+            self._local = CellElimination(self.space, self.forms.cells)
         residual = self._free_residual(unknowns)
         patch = self._local.around(residual)
         enough = _LOCAL_TOLERANCE * np.linalg.norm(residual[patch.unknowns])

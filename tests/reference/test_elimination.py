@@ -30,7 +30,7 @@ def test_the_step_of_a_patch_solves_the_rows_of_the_whole_tangent(kind: str, rng
     residual = rng.standard_normal(space.owned)
     residual[space.fixed] = 0.0
 
-    elimination = CellElimination(space, forms.tangent_form)
+    elimination = CellElimination(space, forms.cells)
     patch = elimination.around(residual)
     step = patch.step(unknowns, residual)
 
