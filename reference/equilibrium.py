@@ -158,8 +158,8 @@ class Problem:
         self._newton.start_count()
         spent = 0
         if self.options.first_step == 1.0 or guess is not None:
-            for start in self._starts(wanted, guess):
-                attempt = self._newton.run(wanted, start)
+            for near, start in self._starts(wanted, guess):
+                attempt = self._newton.run(wanted, start, eliminate=not near)
                 spent += attempt.iterations
                 if attempt.converged:
                     found = replace(attempt, iterations=spent)
@@ -188,15 +188,16 @@ class Problem:
                 f"(first {where[:5]}), which would be lost; set them to zero or move them to free nodes."
             )
 
-    def _starts(self, load: Load, guess: ArrayLike | Equilibrium | None) -> Iterator[Floats]:
+    def _starts(self, load: Load, guess: ArrayLike | Equilibrium | None) -> Iterator[tuple[bool, Floats]]:
+        """States to start from, and whether the equilibrium near them is wanted, and not one that is near rest."""
         fixed = self._space.fixed
         if guess is not None:
             start = self._unknowns(guess, "guess")
             start[fixed] = load.lift[fixed]
-            yield start
-        yield self._first_guess(load)
+            yield True, start
+        yield False, self._first_guess(load)
         if not self._has_lift(load):
-            yield np.zeros_like(load.dead)
+            yield False, np.zeros_like(load.dead)
 
     def _has_lift(self, load: Load) -> bool:
         return self._space.dot(load.lift, load.lift) > 0.0
@@ -285,7 +286,7 @@ class Problem:
         for _ in range(self.options.max_load_steps):
             target = min(1.0, reached + step)
             start = state + self._extended(load.scaled(target - reached))
-            attempt = self._newton.run(load.scaled(target), start, target)
+            attempt = self._newton.run(load.scaled(target), start, target, eliminate=True)
             spent += attempt.iterations
             if not attempt.converged:
                 step *= _CUT

@@ -26,6 +26,7 @@ _SMALLEST_STEP = 1e-8
 _ROUND_OFF = 1e-12  # of the energy: differences below it say nothing about descent
 _EPSILONS = 8.0  # of machine precision in sums of stresses and energies that cancel
 _CUT_STEP = 0.5  # a shorter one calls for elimination
+_MOST_ELIMINATIONS = 3  # of one attempt: what needs more may end on another branch than the one that leaves rest
 _LOCAL_STEPS, _LOCAL_TOLERANCE = 15, 0.1
 _CHORD_STEPS = 8  # with a kept factorisation cost as much as a new one and its iteration
 _prefixes = itertools.count()
@@ -165,17 +166,19 @@ class Newton:
         self.factorisations = self.local_iterations = 0
         self.trace: list[Iteration] = []
 
-    def run(self, load: Load, start: Floats, factor: float = 1.0) -> Attempt:
+    def run(self, load: Load, start: Floats, factor: float = 1.0, eliminate: bool = False) -> Attempt:
         """Iterate from a start whose held unknowns are where they should be.
 
         Args:
             load: the load.
             start: unknowns to start from.
             factor: part of the full load that this is, for the trace.
+            eliminate: balance few cells alone where a step is cut, a few times; then give up.
         """
         self._load, self._factor = load, factor
         self._norms: list[float] = []
         self._search_failed = False
+        self._eliminations = 0 if eliminate and self._can_eliminate else None
         self._length = 1.0
         self._reached: float | None = None  # potential where the last step led
         self._start_tolerance(load)
@@ -270,12 +273,15 @@ class Newton:
             self._length = self._downhill(unknowns, step, np.asarray(self._residual.array_r))  # SNES left it in there
         self._search_failed = self._length == 0.0
         y.array[:] = self._length * step
-        if 0.0 < abs(self._length) < _CUT_STEP and self._eliminates:
-            y.array[:] = unknowns - self._eliminated(unknowns - self._length * step)
+        if self._eliminations is not None and 0.0 < abs(self._length) < _CUT_STEP:
+            self._eliminations += 1
+            self._search_failed = self._eliminations > _MOST_ELIMINATIONS
+            if not self._search_failed:
+                y.array[:] = unknowns - self._eliminated(unknowns - self._length * step)
         return True
 
     @property
-    def _eliminates(self) -> bool:
+    def _can_eliminate(self) -> bool:
         return self.options.elimination and self.search == "energy" and self.space.comm.size == 1
 
     def _eliminated(self, unknowns: Floats) -> Floats:
