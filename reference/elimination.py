@@ -3,6 +3,9 @@
 Under a tool a handful of cells is strained far more than the rest, and for their sake the step of the whole body is cut
 to a tenth or a hundredth. Balanced on their own, all else at rest, they cost a tenth of a step of the whole; from there
 Newton goes on with whole steps. Gong and Cai (SIAM J. Sci. Comput. 41, 2019) do so for hyperelastic arteries.
+
+It must stay a nudge. Under rough loads a few cells have several states of balance of their own, and with many
+eliminations the whole ends on another stable branch than the one that leaves rest: newton.py counts them.
 """
 
 from __future__ import annotations

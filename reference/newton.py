@@ -45,8 +45,9 @@ class NewtonOptions:
             only where a cell would be inside out; PETSc's `bt`, `l2`, `cp` on the residual. A mixed problem has no
             energy to decrease and takes `full` steps for `energy`.
         first_step: part of the load that is tried first; 1 tries the whole load at once, and steps only if that fails.
-        elimination: where the energy's search cuts a step by more than half, balance the cells most out of balance
-            alone before the next (on one rank).
+        elimination: where the energy's search cuts a step by more than half on the way from rest, balance the cells
+            most out of balance alone before the next (three times at most, then load steps; on one rank; never from
+            a guess, whose neighbour is wanted).
         chord: keep a factorisation while it converges fast; False factors in each iteration.
         linear: `band` (LAPACK, for slender bodies; MUMPS for others), `mumps`, `multigrid` (conjugate gradients with
             smoothed aggregation), or `auto` by size and shape.

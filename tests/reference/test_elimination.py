@@ -59,3 +59,30 @@ def test_a_pull_at_one_node_takes_fewer_tangents_to_the_same_state() -> None:
     assert helped.factorisations < plain.factorisations / 2
     assert helped.is_stable and plain.is_stable
     np.testing.assert_allclose(helped.displacement, plain.displacement, rtol=0, atol=1e-8)
+
+
+def test_a_guess_is_followed_to_its_neighbour_without_elimination() -> None:
+    body = box("tetra", 8)
+    forces = np.zeros_like(body.points)
+    forces[np.argmin(np.linalg.norm(body.points - [1.0, 0.5, 1.0], axis=1))] = [100.0, 0.0, 300.0]
+    with Problem(body, MATERIAL, held={"x0": "xyz"}) as problem:
+        state = problem.solve(forces, np.zeros_like(body.points), fallback=False)
+    assert state.local_iterations == 0
+
+
+@pytest.mark.liver
+def test_where_a_rough_load_has_several_states_careful_steps_find_the_same(liver_folder) -> None:
+    """Without a limit on eliminations the whole load ends 16 mm away, on another stable branch."""
+    from liver import POISSON_RATIO, YOUNG_MODULUS, liver, sequence
+
+    data, body = sequence("s3"), liver()
+    mean = data.net_forces[15]
+    noise = np.random.default_rng(4).standard_normal((len(data.tool), 3))
+    forces = np.zeros_like(body.points)
+    forces[data.tool] = (mean + 2.5 * np.linalg.norm(mean) * noise) / len(data.tool)
+    careful = NewtonOptions(elimination=False, first_step=0.05)
+    material = NeoHookean(YOUNG_MODULUS, POISSON_RATIO)
+    with Problem(body, material) as problem, Problem(body, material, careful) as slow:
+        found, followed = problem.solve(forces), slow.solve(forces)
+    assert found.is_stable and followed.is_stable
+    np.testing.assert_allclose(found.displacement, followed.displacement, rtol=0, atol=1e-8)
