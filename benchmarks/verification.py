@@ -1,17 +1,18 @@
 """What the reference solver is checked against, at full size, written as docs/verification.md.
 
-python benchmarks/verification.py [--only closed patch manufactured tangent taylor cook locking]
+python benchmarks/verification.py [--only closed patch manufactured tangent taylor cook locking | --recorded]
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from record import write
+from record import RESULTS, write
 from threadpoolctl import threadpool_limits
 from verification_cases import PLANE, QUADRATIC, SPACE, compressible, incompressible
 from verification_derivatives import STEPS, frame, tangent, taylor, taylor_cases
@@ -431,8 +432,13 @@ STUDIES: dict[str, tuple[Callable[[], Figures], Callable[[Figures], str]]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=STUDIES, help="print the sections of these and write nothing")
-    chosen = parser.parse_args().only
-    figures, sections = {}, []
+    parser.add_argument("--recorded", action="store_true", help="write the page from the records, solving nothing")
+    arguments = parser.parse_args()
+    chosen, figures, sections = arguments.only, {}, []
+    if arguments.recorded:
+        record = json.loads((RESULTS / "verification.json").read_text())["figures"]
+        write_page([page(record[name]) for name, (_, page) in STUDIES.items()])
+        return
     with threadpool_limits(1):
         for name in chosen or STUDIES:
             study, page = STUDIES[name]
@@ -445,6 +451,10 @@ def main() -> None:
         return
     write("verification", figures)
     draw_locking(figures["locking"], DOCS / "verification-locking.png")
+    write_page(sections)
+
+
+def write_page(sections: list[str]) -> None:
     (DOCS / "verification.md").write_text("\n".join([INTRODUCTION, *sections, *recorded_pages()]))
 
 
