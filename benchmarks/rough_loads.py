@@ -81,7 +81,7 @@ def study(count: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    write("rough_loads", study(20))
+    write("rough_loads", study(12))
 
 
 if __name__ == "__main__":
