@@ -110,12 +110,16 @@ def test_a_finished_training_is_not_repeated(data: DataSet, short: TrainingPlan,
 def test_ctrl_c_is_a_keyboard_interrupt_and_leaves_a_whole_checkpoint(
     data: DataSet, short: TrainingPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    handler = signal.getsignal(signal.SIGINT)
-    with monkeypatch.context() as patch:
-        _stop_in_round(patch, 3, lambda: os.kill(os.getpid(), signal.SIGINT))
-        with pytest.raises(KeyboardInterrupt):
-            train(data, short, tmp_path)
-    assert signal.getsignal(signal.SIGINT) is handler
+    handler = signal.default_int_handler
+    before = signal.signal(signal.SIGINT, handler)  # a shell's background job starts with Ctrl-C ignored
+    try:
+        with monkeypatch.context() as patch:
+            _stop_in_round(patch, 3, lambda: os.kill(os.getpid(), signal.SIGINT))
+            with pytest.raises(KeyboardInterrupt):
+                train(data, short, tmp_path)
+        assert signal.getsignal(signal.SIGINT) is handler
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert _same(train(data, short, tmp_path), train(data, short))
 
 
@@ -130,9 +134,9 @@ def test_a_polite_kill_ends_the_program_and_leaves_a_whole_checkpoint(
 
 
 def test_the_time_budget_is_met(data: DataSet, small_plan: TrainingPlan) -> None:
-    surrogate = train(data, replace(small_plan, epochs=None, seconds=1.0))
+    surrogate = train(data, replace(small_plan, epochs=None, seconds=4.0))
     # generous: the time of a step is measured on a machine that others use
-    assert 0.2 < surrogate.card["training"]["seconds"] < 6.0
+    assert 0.8 < surrogate.card["training"]["seconds"] < 24.0
     assert surrogate.card["training"]["steps"] > training.ROUNDS
 
 
