@@ -1,0 +1,66 @@
+"""Tangents summed from their cells against DOLFINx's own assembly: time and difference, in turn, on three bodies."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from liver import POISSON_RATIO, YOUNG_MODULUS, liver
+from record import write
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.shapes import beam
+from softtwin.reference.discretisation import Discretisation
+from softtwin.reference.fenicsx import assemble_matrix, create_matrix
+from softtwin.reference.forms import Forms, Load
+from softtwin.reference.materials import NeoHookean
+
+REPEATS = 15
+
+
+def seconds(call: Callable[[], Any]) -> float:
+    begin = time.perf_counter()
+    call()
+    return time.perf_counter() - begin
+
+
+def compare(body: Body) -> dict[str, Any]:
+    space = Discretisation(body, False, {"fixed": "xyz"})
+    forms = Forms(space, NeoHookean(YOUNG_MODULUS, POISSON_RATIO))
+    state = 1e-5 * body.size * np.random.default_rng(0).standard_normal(space.owned)
+    state[space.fixed] = 0.0
+    load = Load(*np.zeros((2, space.owned)), {})
+    mine, theirs = forms.create_matrix(), create_matrix(forms.tangent_form)
+    pairs = [
+        (
+            seconds(lambda: forms.tangent(state, load, mine)),
+            seconds(lambda: assemble_matrix(theirs, forms.tangent_form, space.conditions)),
+        )
+        for _ in range(REPEATS)
+    ]
+    ours, dolfinx = np.median(pairs, axis=0)
+    a, b = mine.getValuesCSR()[2], theirs.getValuesCSR()[2]
+    return {
+        "cells": len(body.cells),
+        "unknowns": space.size,
+        "summed_ms": 1e3 * float(ours),
+        "dolfinx_ms": 1e3 * float(dolfinx),
+        "largest_difference": float(np.abs(a - b).max() / np.abs(b).max()),
+    }
+
+
+def main() -> None:
+    bodies = {"beam": beam(), "liver": liver(), "large beam": beam((39, 9, 9), (100.0, 25.0, 25.0))}
+    figures = {name: compare(body) for name, body in bodies.items()}
+    for name, row in figures.items():
+        print(name, row)
+    write("assembly", figures)
+
+
+if __name__ == "__main__":
+    main()
