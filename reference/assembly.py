@@ -1,7 +1,6 @@
 """Tangents by way of their cells: all are tabulated, then one sparse product adds them up.
 
-PETSc, entry by entry, would need as long for the adding as DOLFINx for the tabulating; the product takes a fifth of it.
-The matrix is the same to the last bit.
+Entry by entry, PETSc would need longer for the adding (benchmarks/assembly.py). The matrix is the same to the last bit.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Nonlinear elimination: where Newton's step has to be cut, a few cells are balanced alone before the next one.
 
 Under a tool a handful of cells is strained far more than the rest, and for their sake the step of the whole body is cut
-to a tenth or a hundredth. Balanced on their own, all else at rest, they cost a tenth of a step of the whole; from there
-Newton goes on with whole steps. Gong and Cai (SIAM J. Sci. Comput. 41, 2019) do so for hyperelastic arteries.
+to a tenth or a hundredth. Balanced on their own, all else at rest, they cost little; from there Newton goes on with
+whole steps. Gong and Cai (SIAM J. Sci. Comput. 41, 2019) do so for hyperelastic arteries.
 
 It must stay a nudge. Under rough loads a few cells have several states of balance of their own, and with many
 eliminations the whole ends on another stable branch than the one that leaves rest: newton.py counts them.
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import splu
 
+from .assembly import cell_unknowns
 from .discretisation import Discretisation
 from .fenicsx import CellMatrices, cell_dofs
 
@@ -34,7 +35,7 @@ class CellElimination:
 
     def __init__(self, space: Discretisation, matrices: CellMatrices) -> None:
         self.space, self._matrices = space, matrices
-        self._blocks = cell_dofs(space.space)
+        self._blocks, self._unknowns = cell_dofs(space.space), cell_unknowns(space)
         self._count = min(int(np.ceil(_SHARE * len(space.body.points))), _MOST)
         self._free = np.ones(space.owned, dtype=bool)
         self._free[space.fixed] = False
@@ -65,8 +66,7 @@ class Patch:
         self._cells = np.flatnonzero(nodes[whole._blocks].any(axis=1))
         place = np.full(len(inside), -1)
         place[self.unknowns] = np.arange(len(self.unknowns))
-        blocks = whole._blocks[self._cells]
-        mine = place[(blocks[:, :, None] * dimension + np.arange(dimension)).reshape(len(blocks), -1)]
+        mine = place[whole._unknowns[self._cells]]
         rows, columns = np.broadcast_arrays(mine[:, :, None], mine[:, None, :])
         self._entries = np.flatnonzero((rows >= 0) & (columns >= 0))
         self._rows, self._columns = rows.ravel()[self._entries], columns.ravel()[self._entries]

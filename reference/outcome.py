@@ -48,7 +48,7 @@ class Equilibrium:
             eliminated): 0 is a stable state, None was not asked for or is not known (multigrid, L U).
         pressure: (n,), pascals, positive in compression, where it is an unknown.
         trace: every iteration, where asked for.
-        local_iterations: Newton iterations of a few cells alone (nonlinear elimination), a tenth of the others' cost.
+        local_iterations: Newton iterations of a few cells alone (nonlinear elimination).
     """
 
     displacement: Floats
