@@ -8,10 +8,12 @@ from pathlib import Path
 from softtwin.meshes.files import read_body
 from softtwin.reference.dataset import DataSet, DataSetError
 
-from .build import Workspace, generate_in_parallel, mesh_stage, open_workspace
 from .config import Config, ConfigError, to_toml
-from .learn import train_stage, validate_stage
+from .launch import generate_in_parallel
 from .register import NOTICE
+from .stages.learn import train_stage, validate_stage
+from .stages.mesh import mesh_stage
+from .workspace import Workspace, open_workspace
 
 
 def build_twin(config: Config, output: Path, say: Callable[[str], None]) -> Workspace:

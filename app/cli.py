@@ -54,7 +54,8 @@ def config() -> None:
 @click.argument("configuration", type=_EXISTING)
 def mesh(configuration: Path) -> None:
     """Make the body of CONFIGURATION: read or make a surface, fill it with tetrahedra, report the quality."""
-    from .build import mesh_stage, open_workspace
+    from .stages.mesh import mesh_stage
+    from .workspace import open_workspace
 
     space = open_workspace(configuration)
     body = mesh_stage(space)
@@ -67,8 +68,9 @@ def mesh(configuration: Path) -> None:
 @click.option("--redo", multiple=True, type=int, help="Make this block again (may be repeated).")
 def generate(configuration: Path, redo: tuple[int, ...]) -> None:
     """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped."""
-    from .build import generate_stage, open_workspace
     from .chain import describe_data
+    from .stages.generate import generate_stage
+    from .workspace import open_workspace
 
     space = open_workspace(configuration)
     data = generate_stage(space, redo)
@@ -82,8 +84,8 @@ def generate(configuration: Path, redo: tuple[int, ...]) -> None:
 @click.option("--fresh", is_flag=True, help="Throw earlier checkpoints away instead of going on from them.")
 def train(configuration: Path, fresh: bool) -> None:
     """Train the surrogate of CONFIGURATION on its data set and write the twin. Goes on from the last checkpoint."""
-    from .build import open_workspace
-    from .learn import train_stage
+    from .stages.learn import train_stage
+    from .workspace import open_workspace
 
     space = open_workspace(configuration)
     if fresh and space.training.exists():
@@ -96,8 +98,8 @@ def train(configuration: Path, fresh: bool) -> None:
 @click.argument("configuration", type=_EXISTING)
 def validate(configuration: Path) -> None:
     """Measure the twin's errors on the held-out samples, every definition printed."""
-    from .build import open_workspace
-    from .learn import validate_stage
+    from .stages.learn import validate_stage
+    from .workspace import open_workspace
 
     click.echo(validate_stage(open_workspace(configuration)))
 
@@ -144,8 +146,8 @@ def _read_truth(path: Path, frames: int, nodes: int) -> np.ndarray[Any, np.dtype
 @click.argument("configuration", type=_EXISTING)
 def report(configuration: Path) -> None:
     """Write the HTML report of what CONFIGURATION's stages have made so far."""
-    from .build import open_workspace
     from .report import report_stage
+    from .workspace import open_workspace
 
     click.echo(f"report written to {report_stage(open_workspace(configuration))}")
 

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
+from softtwin.meshes.embedding import target_points
 from softtwin.meshes.files import read_body
 
-from .build import Workspace, target_points, timed
 from .chain import make_twin, prepare
 from .config import Config, RegistrationSection
 from .register import NOTICE, forward_model, make_registrar, register_clouds
 from .report import report_stage
+from .workspace import Workspace, timed
 
 Floats = NDArray[np.float64]
 _CAMERA = np.array([-0.3, -1.0, 0.25])  # from the organ towards the camera: the phantom's front, a little from above

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import check_cloud
+from softtwin.meshes.embedding import target_points
 from softtwin.meshes.files import read_body, read_cloud, write_deformed
 from softtwin.meshes.metrics import target_errors
 from softtwin.reference.loads import loaded_nodes
@@ -24,8 +25,8 @@ from softtwin.registration.minimise import Registrar, Registration, Registration
 from softtwin.registration.objective import CloudObjective
 from softtwin.registration.sequence import register_sequence
 
-from .build import load_plan, target_points
 from .config import Config, ConfigError, RegistrationSection, read_config
+from .stages.generate import load_plan
 
 Floats = NDArray[np.float64]
 NOTICE = "Research software: not a medical device."

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from record import write
 
-from softtwin.app.build import generate_in_parallel
+from softtwin.app.launch import generate_in_parallel
 from softtwin.app.chain import prepare
 from softtwin.app.config import Config
 from softtwin.meshes.files import write_body

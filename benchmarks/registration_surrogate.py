@@ -15,10 +15,11 @@ from record import write
 from registration_reference import run, summary
 from threadpoolctl import threadpool_limits
 
-from softtwin.app.build import Workspace, generate_in_parallel
 from softtwin.app.chain import prepare
 from softtwin.app.config import Config
-from softtwin.app.learn import train_stage, validate_stage
+from softtwin.app.launch import generate_in_parallel
+from softtwin.app.stages.learn import train_stage, validate_stage
+from softtwin.app.workspace import Workspace
 from softtwin.meshes.files import write_body
 from softtwin.registration.minimise import RegistrationOptions
 

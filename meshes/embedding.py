@@ -113,6 +113,11 @@ def carried(body: Body, displacement: ArrayLike) -> dict[str, Surface]:
     }
 
 
+def target_points(body: Body) -> dict[str, Embedding]:
+    """Embeddings of the vertices of the inner surfaces, by name: what target errors are measured at."""
+    return {name: embed(body, surface.points) for name, surface in body.inner.items()}
+
+
 def _containing_cells(body: Body, points: Floats) -> Ints:
     """Number of the cell around each point, -1 where there is none."""
     cells, numbers = _candidates(body, points)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import pyvista
 
-from softtwin.app.build import make_body
+from softtwin.app.organ import make_body
 from softtwin.app.cli import main
 from softtwin.app.config import BodySection, Config, to_toml
 from softtwin.app.register import forward_model, make_registrar, open_twin, register_clouds
@@ -109,7 +109,7 @@ def test_a_surface_in_millimetres_becomes_a_body_in_metres(sphere: Path, cap: Pa
 def test_lone_listed_nodes_are_not_an_attachment() -> None:
     """An attachment is a surface: a listed node without a whole listed triangle is left free."""
     bare = beam((6, 2, 2), (0.6, 0.2, 0.2), "tetrahedron")
-    from softtwin.app.build import _attached
+    from softtwin.app.organ import _attached
 
     lone = int(bare.node_sets["tip"][0])
     assert np.array_equal(_attached(bare, np.append(bare.fixed, lone)), bare.fixed)

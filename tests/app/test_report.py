@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from softtwin.app import pictures, report
-from softtwin.app.build import Workspace
+from softtwin.app.workspace import Workspace
 from softtwin.app.config import Config
 from softtwin.app.pictures import Studio, camera_side, view_of
 from softtwin.app.report import figure, inner_colours, public_config, report_stage, without_paths

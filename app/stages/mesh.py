@@ -1,0 +1,24 @@
+"""The meshed body of a configuration, written with its quality."""
+
+from __future__ import annotations
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.files import write_body
+from softtwin.meshes.metrics import mesh_quality
+
+from ..organ import make_body
+from ..workspace import Workspace, timed
+
+
+def mesh_stage(space: Workspace) -> Body:
+    """Make the body and write it.
+
+    Raises:
+        FileError, SurfaceError, BodyError, ConfigError: what is wrong with the input.
+    """
+    space.folder.mkdir(parents=True, exist_ok=True)
+    with timed(space, "mesh"):
+        body = make_body(space.config.body, space.root)
+        write_body(space.body, body)
+        (space.folder / "mesh_quality.txt").write_text(str(mesh_quality(body)) + "\n")
+    return body
