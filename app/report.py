@@ -20,17 +20,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.embedding import Embedding, carried
-from softtwin.meshes.embedding import target_points
+from softtwin.meshes.embedding import Embedding, carried, target_points
 from softtwin.meshes.files import read_body
 from softtwin.meshes.metrics import mesh_quality, nodal_errors
 from softtwin.reference.dataset import SPLITS, DataSet
 from softtwin.registration.objective import CloudObjective
 
-from .workspace import Workspace
 from .config import Config, to_toml
 from .pictures import DISPLACEMENT, ORGAN, Layer, Picture, Studio, camera_side, chart, rendering_problem, view_of
 from .register import NOTICE
+from .workspace import Workspace
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from record import write
 
-from softtwin.app.launch import generate_in_parallel
 from softtwin.app.chain import prepare
 from softtwin.app.config import Config
+from softtwin.app.launch import generate_in_parallel
 from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.dataset import DataSet, Samples

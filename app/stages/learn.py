@@ -14,8 +14,8 @@ from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.predictor import Surrogate, load, save
 from softtwin.surrogate.train import TrainingPlan, train
 
-from ..workspace import Workspace, timed
 from ..config import to_toml
+from ..workspace import Workspace, timed
 
 
 def train_stage(space: Workspace) -> Surrogate:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import pyvista
 
-from softtwin.app.organ import make_body
 from softtwin.app.cli import main
 from softtwin.app.config import BodySection, Config, to_toml
+from softtwin.app.organ import make_body
 from softtwin.app.register import forward_model, make_registrar, open_twin, register_clouds
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from softtwin.app import pictures, report
-from softtwin.app.workspace import Workspace
 from softtwin.app.config import Config
 from softtwin.app.pictures import Studio, camera_side, view_of
 from softtwin.app.report import figure, inner_colours, public_config, report_stage, without_paths
+from softtwin.app.workspace import Workspace
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
