@@ -1,0 +1,200 @@
+"""Clouds to states of one body: prepared once, then frame after frame, each from what the last one found."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softtwin.meshes.clouds import check_cloud
+
+from .evidence import Scale
+from .forward import ForwardModel, State, reduce_model
+from .gauss_newton import Found, GaussNewton, Step
+from .lbfgs import LBFGS
+from .outcome import Outcome
+from .pose import Pose
+from .problem import Problem
+from .residuals import SurfaceDistance
+from .thinning import thinned
+from .unknowns import Forces, PosePrior
+from .verdict import Expectations, Judgement, judge
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RegistrationOptions:
+    """How a cloud is trusted and by what it is registered.
+
+    Args:
+        noise: what is believed of the standard deviation of a point's distance, metres; found from the cloud.
+        solver: how the objective is minimised.
+        most_points: larger clouds are thinned to so many points.
+    """
+
+    noise: Scale = Scale(5e-4, 1.5, least=2e-5)
+    solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
+    most_points: int = 1000
+
+    def __post_init__(self) -> None:
+        if self.most_points < 1:
+            raise ValueError(f"RegistrationOptions.most_points: expected at least 1, got {self.most_points}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """One registered cloud.
+
+    Args:
+        coefficients: of forces and pose, (k,).
+        forces: nodal forces, (n, 3), newtons.
+        state: the body's state, with its derivatives.
+        pose: from the body's coordinates to the cloud's.
+        net_force: (3,), newtons.
+        net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
+        noise: standard deviation of a point's distance that was found, metres.
+        force_scale: standard deviation of the force coefficients that was found, newtons.
+        rms_distance: of the cloud to the registered surface, metres.
+        outliers: share of the points that pulled nothing.
+        informed: directions of force and pose that the cloud told.
+        points: points that were used, after thinning.
+        outcome: how the solver ended.
+        judgement: whether the result can be used, and why not.
+        evaluations: forward solves.
+        seconds: wall time.
+        trace: one entry an iteration.
+    """
+
+    coefficients: Floats
+    forces: Floats
+    state: State
+    pose: Pose
+    net_force: Floats
+    net_force_covariance: Floats
+    noise: float
+    force_scale: float
+    rms_distance: float
+    outliers: float
+    informed: float
+    points: int
+    outcome: Outcome
+    judgement: Judgement
+    evaluations: int
+    seconds: float
+    trace: tuple[Step, ...]
+
+    @property
+    def displacement(self) -> Floats:
+        """Of all nodes, (n, 3), metres, in the body's coordinates."""
+        return self.state.displacement
+
+    @property
+    def net_force_deviation(self) -> Floats:
+        """Standard deviation of each component of the net force, (3,), newtons."""
+        return np.sqrt(np.diag(self.net_force_covariance))
+
+
+class Registrar:
+    """Registers clouds to one body with one model; what does not depend on the cloud is prepared once.
+
+    Args:
+        model: forward model.
+        observed: the observed side.
+        forces: the unknown forces.
+        options: noise, solver, thinning.
+        pose: prior of the pose; None for clouds in the body's coordinates.
+        expectations: what a usable result looks like; those of the model where it knows some.
+    """
+
+    def __init__(
+        self,
+        model: ForwardModel,
+        observed: SurfaceDistance,
+        forces: Forces,
+        options: RegistrationOptions | None = None,
+        *,
+        pose: PosePrior | None = None,
+        expectations: Expectations | None = None,
+    ) -> None:
+        self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
+        self.options = options or RegistrationOptions()
+        self.expectations = expectations or Expectations.of(model, self.options.noise)
+        self._reduced = reduce_model(model, observed.nodes, forces.basis)
+
+    def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
+        """The forces, the state and the pose that bring the observed side to a cloud.
+
+        Args:
+            cloud: observed points, (p, 3), metres.
+            start: an earlier frame's result to start from; no force if not given.
+
+        Raises:
+            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+            NotConverged: the model found no state at the start.
+        """
+        begin = time.perf_counter()
+        points = self._checked(cloud)
+        problem = Problem(self._reduced, self.observed, self.forces, self.pose, points, self.options.noise)
+        first = np.zeros(problem.size) if start is None else start.coefficients
+        found = self.options.solver.solve(problem, first)
+        return self._result(problem, found, begin)
+
+    def _checked(self, cloud: ArrayLike) -> Floats:
+        points = np.asarray(cloud, dtype=np.float64)
+        if points.ndim == 2 and points.shape[1:] == (3,):
+            finite: Any = np.isfinite(points).all()
+            points = points[thinned(points, self.options.most_points)] if finite else points
+        if self.pose is not None and points.ndim == 2 and points.shape[1:] == (3,):
+            check_cloud(self.pose.mean.inverse().apply(points), self.model.body)
+            return points
+        return check_cloud(points, self.model.body)
+
+    def _result(self, problem: Problem, found: Found, begin: float) -> Registration:
+        trial, forces = found.trial, self.forces
+        inner = trial.coefficients[problem.force_part]
+        nodal = forces.forces(inner)
+        state = trial.state.full
+        return Registration(
+            coefficients=trial.coefficients,
+            forces=nodal,
+            state=state,
+            pose=trial.pose or Pose.identity(),
+            net_force=nodal.sum(axis=0),
+            net_force_covariance=found.posterior.net_force_covariance(forces),
+            noise=found.posterior.scales.noise,
+            force_scale=found.posterior.scales.force,
+            rms_distance=trial.match.rms,
+            outliers=float(np.mean(found.weights < 0.05)),
+            informed=found.posterior.informed,
+            points=len(problem.cloud),
+            outcome=found.outcome,
+            judgement=judge(problem, found, state, self.expectations),
+            evaluations=found.evaluations,
+            seconds=time.perf_counter() - begin,
+            trace=found.trace,
+        )
+
+
+def register_sequence(registrar: Registrar, clouds: Iterable[ArrayLike]) -> Iterator[Registration]:
+    """Register clouds in their order, as they come; the caller may stop between any two.
+
+    A frame starts from the last one that was not refused.
+
+    Args:
+        registrar: model, observed side, unknowns and options.
+        clouds: one cloud a frame, (p, 3), metres.
+
+    Raises:
+        CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+    """
+    last = None
+    for cloud in clouds:
+        result = registrar.register(cloud, last)
+        if result.judgement.is_usable:
+            last = result
+        yield result
