@@ -61,9 +61,9 @@ def forward_model(name: str, folder: Path, body: Body, config: Config) -> Iterat
 
         yield load(folder, body)
         return
-    from softtwin.reference.adjoint import ReferenceModel  # FEniCSx is needed here alone
     from softtwin.reference.equilibrium import NewtonOptions, Problem
     from softtwin.reference.materials import MATERIALS
+    from softtwin.reference.model import ReferenceModel  # FEniCSx is needed here alone
 
     material = MATERIALS[config.material.law](config.material.young_modulus, config.material.poisson_ratio)
     with Problem(body, material, NewtonOptions(tolerance=1e-5, max_iterations=15)) as problem:

@@ -15,9 +15,9 @@ from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequ
 from record import write
 
 from softtwin.meshes.embedding import embed
-from softtwin.reference.adjoint import ReferenceModel
 from softtwin.reference.equilibrium import NewtonOptions, Problem
 from softtwin.reference.materials import NeoHookean
+from softtwin.reference.model import ReferenceModel
 from softtwin.registration.control import nodal_control
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.minimise import Registrar, RegistrationOptions

@@ -143,8 +143,8 @@ class Problem:
 
         Args:
             load: the load, or nodal forces alone, (n, 3), newtons.
-            guess: displacement to start from, (n, 3), metres, or another equilibrium; the warped linear response if not
-                given.
+            guess: displacement to start from, (n, 3), metres, or another equilibrium, which is first moved along its
+                tangent by the change of the load; the warped linear response if not given.
             stability: also factor the tangent at the state and count its negative pivots.
             fallback: try the other ways where the first start fails; without, a failure is raised at once.
             trace: keep every iteration in the result.
@@ -153,30 +153,32 @@ class Problem:
             ValueError: wrong shape, NaN or infinity, unknown names, forces on held nodes.
             NotConverged: no way led to an equilibrium; it holds the last one that was found on the way.
         """
-        wanted = self._load(load)
+        given, wanted = self._load(load)
+        start = self._start(guess, wanted)
         self._newton.suit(wanted)
         self._newton.start_count()
         spent = 0
         if self.options.first_step == 1.0 or guess is not None:
-            for near, start in self._starts(wanted, guess):
-                attempt = self._newton.run(wanted, start, eliminate=not near)
+            for near, unknowns in self._starts(wanted, start):
+                attempt = self._newton.run(wanted, unknowns, eliminate=not near)
                 spent += attempt.iterations
                 if attempt.converged:
                     found = replace(attempt, iterations=spent)
-                    return self._result(found, wanted, load_steps=1, stability=stability, trace=trace)
+                    return self._result(found, given, wanted, load_steps=1, stability=stability, trace=trace)
                 if not fallback:
                     raise NotConverged(
                         f"Problem.solve: no equilibrium near the guess ({attempt.reason_name} after "
                         f"{attempt.iterations} iterations).",
                         trace=tuple(self._newton.trace),
                     )
-        return self._solve_in_steps(wanted, spent, stability, trace)
+        return self._solve_in_steps(given, wanted, spent, stability, trace)
 
-    def _load(self, load: Loading | ArrayLike) -> Load:
-        checked = checked_loading(load, self.body, self.held)
+    def _load(self, load: Loading | ArrayLike) -> tuple[Loading, Load]:
+        """A load in the body's numbers, a copy of the caller's, and as unknowns."""
+        checked = checked_loading(load, self.body, self.held).scaled(1.0)
         if checked.forces is not None:
             self._check_lost(np.asarray(checked.forces))
-        return self._forms.load(checked)
+        return checked, self._forms.load(checked)
 
     def _check_lost(self, forces: Floats) -> None:
         lost = np.where(self._space.held, forces, 0.0)
@@ -188,13 +190,26 @@ class Problem:
                 f"(first {where[:5]}), which would be lost; set them to zero or move them to free nodes."
             )
 
-    def _starts(self, load: Load, guess: ArrayLike | Equilibrium | None) -> Iterator[tuple[bool, Floats]]:
+    def _start(self, guess: ArrayLike | Equilibrium | None, load: Load) -> Floats | None:
+        """The guess as unknowns, held ones where the load wants them."""
+        if guess is None:
+            return None
+        start = self._unknowns(guess, "guess")
+        start[self._space.fixed] = load.lift[self._space.fixed]
+        return self._ahead(guess, start, load) if isinstance(guess, Equilibrium) else start
+
+    def _ahead(self, state: Equilibrium, start: Floats, load: Load) -> Floats:
+        """A state moved along its tangent by the change of the load, unless that turns a cell inside out."""
+        gap = self._forms.residual(start, load)
+        gap[self._space.fixed] = 0.0
+        self._linearise(state)
+        ahead = start - self._newton.linear.solve(gap[None])[0]
+        return ahead if np.isfinite(self._forms.energy(ahead)) else start
+
+    def _starts(self, load: Load, guess: Floats | None) -> Iterator[tuple[bool, Floats]]:
         """States to start from, and whether the equilibrium near them is wanted, and not one that is near rest."""
-        fixed = self._space.fixed
         if guess is not None:
-            start = self._unknowns(guess, "guess")
-            start[fixed] = load.lift[fixed]
-            yield True, start
+            yield True, guess
         yield False, self._first_guess(load)
         if not self._has_lift(load):
             yield False, np.zeros_like(load.dead)
@@ -278,7 +293,7 @@ class Problem:
         assemble(matrix, laplacian, space.conditions)
         self._poisson = LinearSolver(matrix, space, self._newton.linear.method, turns=False)
 
-    def _solve_in_steps(self, load: Load, spent: int, stability: bool, trace: bool) -> Equilibrium:
+    def _solve_in_steps(self, given: Loading, load: Load, spent: int, stability: bool, trace: bool) -> Equilibrium:
         reached, good = 0.0, 0
         step = min(_FIRST_STEP, self.options.first_step) if spent else self.options.first_step
         state = np.zeros_like(load.dead)
@@ -296,9 +311,11 @@ class Problem:
             reached, state, good, last = target, attempt.unknowns, good + 1, attempt
             step *= _GROWTH
             if reached == 1.0:
-                return self._result(replace(attempt, iterations=spent), load, good, stability, trace)
+                return self._result(replace(attempt, iterations=spent), given, load, good, stability, trace)
         lines = tuple(self._newton.trace)
-        found = None if last is None else self._result(last, load.scaled(reached), good, True, False)
+        found = None
+        if last is not None:
+            found = self._result(last, given.scaled(reached), load.scaled(reached), good, True, False)
         advice = (
             "No more load can be added there: a limit point, or a mesh too coarse for it. Try a smaller load, a finer "
             "mesh, or displacements prescribed instead of forces."
@@ -313,7 +330,9 @@ class Problem:
             lines,
         )
 
-    def _result(self, attempt: Attempt, load: Load, load_steps: int, stability: bool, trace: bool) -> Equilibrium:
+    def _result(
+        self, attempt: Attempt, given: Loading, load: Load, load_steps: int, stability: bool, trace: bool
+    ) -> Equilibrium:
         unknowns = attempt.unknowns
         energy = self._forms.potential(unknowns, load) + self._forms.pressure_potential(unknowns, load)
         iterations, factorisations = attempt.iterations, self._newton.factorisations
@@ -330,6 +349,7 @@ class Problem:
             pressure=self._space.pressure(unknowns),
             trace=lines,
             local_iterations=self._newton.local_iterations,
+            load=given,
         )
 
     # ------------------------------------------------------------------ the tangent at a state
@@ -349,7 +369,7 @@ class Problem:
             load: the load.
             displacement: gives the shape that a following pressure acts on, (n, 3), metres; rest if not given.
         """
-        wanted = self._load(load)
+        _, wanted = self._load(load)
         unknowns = self._unknowns(displacement)
         pressed = self._forms.pressed(unknowns, wanted)
         pressed[self._space.fixed] = 0.0
@@ -358,12 +378,14 @@ class Problem:
     def stiffness(self, displacement: ArrayLike | Equilibrium | None = None) -> csr_matrix:
         """Tangent stiffness in the body's order, (3n, 3n), N/m; rows and columns of held axes are the identity's.
 
+        An equilibrium's following pressures are part of it; a displacement alone has none.
+
         Raises:
             RuntimeError: the mesh is shared between ranks, or pressures are unknowns.
         """
         if self._space.comm.size > 1 or self._space.mixed:
             raise RuntimeError("Problem.stiffness: expected one rank and displacements alone as unknowns.")
-        self._newton.assemble(self._unknowns(displacement), self._unloaded)
+        self._linearise(displacement)
         return self._in_body_order(self._newton.matrix)
 
     def mass(self, density: float = 1.0) -> csr_matrix:
@@ -388,35 +410,64 @@ class Problem:
         index[rows] = self._space.own_numbers
         return csr_matrix((data, indices, indptr), shape=matrix.getSize())[index][:, index]
 
-    def apply_inverse(self, columns: ArrayLike, displacement: ArrayLike | Equilibrium | None = None) -> Floats:
+    def apply_inverse(
+        self, columns: ArrayLike, displacement: ArrayLike | Equilibrium | None = None, *, transpose: bool = False
+    ) -> Floats:
         """K(u)^-1 applied to many right-hand sides with one factorisation.
 
         Args:
             columns: nodal forces or cotangents, (3n, k) or (3n,), in the body's order; held axes are ignored.
-            displacement: state u, (n, 3), metres; rest if not given. The last factorisation is used again where it was
-                made at the same state.
+            displacement: an equilibrium, whose pressures belong to its tangent; or a displacement alone, (n, 3),
+                metres, under no following pressure; rest if not given. The last factorisation is used again where it
+                was made at the same state.
+            transpose: K(u)^-T; another matrix where a following pressure makes the tangent unsymmetric.
+
+        Raises:
+            ValueError: wrong shape, or a displacement alone where the pressure is an unknown.
         """
         right = np.asarray(columns, dtype=np.float64)
         count = self.body.points.size
         if right.shape[:1] != (count,) or right.ndim > 2:
             raise ValueError(f"apply_inverse.columns: expected shape ({count}, k), got {right.shape}.")
-        self._newton.assemble(self._unknowns(displacement), self._unloaded)
+        self._linearise(displacement)
         stacked = right.reshape(count, -1).T.reshape(-1, *self.body.points.shape)
         rows = np.array([self._space.unknowns("columns", field) for field in stacked])
         rows[:, self._space.fixed] = 0.0
-        solved = self._newton.linear.solve(rows)
+        solved = self._newton.linear.solve(rows, transpose)
         return np.array([self._space.field(row).ravel() for row in solved]).T.reshape(right.shape)
 
     def negative_pivots(self, displacement: ArrayLike | Equilibrium | None = None) -> int | None:
-        """Negative pivots of the tangent at a state: 0 is stable, None where nothing is factored (multigrid)."""
-        return self._negative_pivots(self._unknowns(displacement), self._unloaded)
+        """Negative pivots of the tangent at a state: 0 is stable.
+
+        None where nothing is factored (multigrid) or where following pressures make the tangent unsymmetric.
+
+        Args:
+            displacement: an equilibrium, or a displacement alone, (n, 3), under no following pressure; rest if not
+                given.
+        """
+        return self._negative_pivots(*self._tangent_point(displacement))
 
     def _negative_pivots(self, unknowns: Floats, load: Load) -> int | None:
-        if self._newton.linear.method == "multigrid" or not self._newton.symmetric:
+        if self._newton.linear.method == "multigrid":
             return None
-        self._newton.assemble(unknowns, load)
+        self._newton.linearise(unknowns, load)
         pivots = self._newton.linear.negative_pivots()
         return None if pivots is None else pivots - self._space.pressures  # a saddle point has one for each pressure
+
+    def _linearise(self, state: ArrayLike | Equilibrium | None) -> None:
+        self._newton.linearise(*self._tangent_point(state))
+
+    def _tangent_point(self, state: ArrayLike | Equilibrium | None) -> tuple[Floats, Load]:
+        """What a tangent depends on: unknowns, and following pressures."""
+        if isinstance(state, Equilibrium):
+            pressure = {name: float(value) for name, value in state.load.pressure.items() if value != 0.0}
+            return self._unknowns(state), replace(self._unloaded, pressure=pressure)
+        if state is not None and self._space.mixed:
+            raise ValueError(
+                "Problem.displacement: expected an Equilibrium, for the tangent depends on its pressure, "
+                f"got {type(state).__name__}."
+            )
+        return self._unknowns(state), self._unloaded
 
     def _unknowns(self, state: ArrayLike | Equilibrium | None, name: str = "displacement") -> Floats:
         if state is None:
