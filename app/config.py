@@ -118,10 +118,11 @@ class RegistrationSection(_Section):
 
     model: Literal["surrogate", "reference"] = Field("surrogate", description="which forward model registers")
     zone: str = Field("", description="zone whose nodes may carry force; empty: all loaded nodes")
-    noise: Positive = Field(5e-4, description="expected noise of the cloud, metres")
-    force_scale: Positive = Field(0.1, description="expected size of a nodal force, newtons")
+    noise: Positive = Field(5e-4, description="noise of the cloud to begin with, metres; it is found")
+    force_scale: Positive = Field(0.01, description="nodal force to begin with, newtons; its size is found")
     smoothness: float = Field(0.02, ge=0.0, description="correlation length of neighbouring forces, metres; 0: none")
     max_iterations: Count = Field(40, description="iterations for one cloud")
+    directions: Count = Field(64, description="most directions of force kept: those that a cloud tells best")
 
 
 class Config(_Section):

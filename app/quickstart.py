@@ -71,8 +71,7 @@ def demo_stage(space: Workspace, say: Callable[[str], None]) -> None:
     body = read_body(space.body)
     with timed(space, "demo"), forward_model("reference", space.twin, body, space.config) as reference:
         forces, zone = unseen_load(body, reference, space.config.loads.displacement)
-        reference.reset()
-        truth = reference.solve(forces)
+        truth = reference.solve(forces).displacement
         cloud = partial_view(body, truth, _CAMERA, _POINTS, _NOISE, np.random.default_rng(11), surface="observed")
         np.save(folder / "cloud.npy", cloud)
         np.save(folder / "truth.npy", truth)
@@ -101,7 +100,7 @@ def unseen_load(body: Body, model: Any, displacement: float) -> tuple[Floats, ND
     forces = np.zeros_like(body.points)
     forces[tool] = np.array([0.25, -0.75, 0.6]) / len(tool)
     for _ in range(4):
-        reached = np.linalg.norm(model.solve(forces), axis=1).max()
+        reached = np.linalg.norm(model.solve(forces).displacement, axis=1).max()
         forces *= 0.8 * displacement / reached
     return forces, zone
 

@@ -19,17 +19,20 @@ from softtwin.meshes.embedding import target_points
 from softtwin.meshes.files import read_body, read_cloud, write_deformed
 from softtwin.meshes.metrics import target_errors
 from softtwin.reference.loads import loaded_nodes
-from softtwin.registration.control import nodal_control
+from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel
-from softtwin.registration.minimise import Registrar, Registration, RegistrationOptions
-from softtwin.registration.objective import CloudObjective
-from softtwin.registration.sequence import register_sequence
+from softtwin.registration.gauss_newton import GaussNewton
+from softtwin.registration.registrar import Registrar, Registration, RegistrationOptions, register_sequence
+from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.unknowns import Informed, informed, nodal_forces
 
 from .config import Config, ConfigError, RegistrationSection, read_config
 from .stages.generate import load_plan
 
 Floats = NDArray[np.float64]
 NOTICE = "Research software: not a medical device."
+_FORCE_SPREAD, _NOISE_SPREAD = 2.0, 1.5  # of the logarithms: both scales are found from the cloud
+_LEAST_NOISE = 1e-4  # metres; no camera is better
 
 
 def open_twin(folder: Path | str) -> tuple[Body, Config]:
@@ -76,9 +79,13 @@ def make_registrar(model: ForwardModel, config: Config, section: RegistrationSec
     if section.zone and section.zone not in body.node_sets:
         raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {section.zone!r}.")
     nodes = body.node_sets[section.zone] if section.zone else loaded_nodes(body, load_plan(config))
-    control = nodal_control(body, nodes, section.force_scale, section.smoothness)
-    options = RegistrationOptions(noise=section.noise, max_iterations=section.max_iterations)
-    return Registrar(model, CloudObjective(body, body.surfaces.get("observed")), control, options)
+    observed = SurfaceDistance(body, body.surfaces.get("observed"))
+    scale = Scale(section.force_scale, _FORCE_SPREAD, least=1e-3 * section.force_scale)
+    every = nodal_forces(body, nodes, scale, section.smoothness)
+    forces = informed(every, model, observed, Informed(scale=3.0 * section.force_scale, most=section.directions))
+    noise = Scale(section.noise, _NOISE_SPREAD, least=min(_LEAST_NOISE, section.noise))
+    options = RegistrationOptions(noise, GaussNewton(max_iterations=section.max_iterations))
+    return Registrar(model, observed, forces, options)
 
 
 def read_clouds(paths: Sequence[Path], unit: str, body: Body) -> list[Floats]:
@@ -140,7 +147,13 @@ def frame_figures(
         "largest_displacement_m": float(np.linalg.norm(result.displacement, axis=1).max()),
         "seconds": result.seconds,
         "iterations": len(result.trace),
-        "reason": result.reason,
+        "outcome": result.outcome.name.lower(),
+        "verdict": result.judgement.verdict.value,
+        "reasons": list(result.judgement.reasons),
+        "noise_m": result.noise,
+        "force_scale_N": result.force_scale,
+        "outliers": result.outliers,
+        "points": result.points,
         "targets": {
             name: {"movement_m": _mean_length(points.displace(result.displacement))} for name, points in targets.items()
         },

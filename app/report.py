@@ -24,7 +24,7 @@ from softtwin.meshes.embedding import Embedding, carried, target_points
 from softtwin.meshes.files import read_body
 from softtwin.meshes.metrics import mesh_quality, nodal_errors
 from softtwin.reference.dataset import SPLITS, DataSet
-from softtwin.registration.objective import CloudObjective
+from softtwin.registration.residuals import SurfaceDistance
 
 from .config import Config, to_toml
 from .pictures import DISPLACEMENT, ORGAN, Layer, Picture, Studio, camera_side, chart, rendering_problem, view_of
@@ -403,8 +403,8 @@ def _apart(targets: Mapping[str, Embedding], first: Floats, second: Floats) -> d
 
 def _cloud_distance(body: Body, displacement: Floats, cloud: Floats) -> float:
     """Root mean square distance of the cloud to the observed side, metres."""
-    objective = CloudObjective(body, body.surfaces.get("observed"))
-    return float(np.sqrt(np.mean(objective.match(displacement[objective.nodes], cloud).distances ** 2)))
+    observed = SurfaceDistance(body, body.surfaces.get("observed"))
+    return observed.match(displacement[observed.nodes], cloud).rms
 
 
 def _wide_pictures(

@@ -87,6 +87,10 @@ class ReferenceState:
         """Of the nodes, (n, 3), metres."""
         return self.equilibrium.displacement
 
+    @property
+    def extent(self) -> None:
+        """None: the reference has learned nothing that it could leave."""
+
     @cached_property
     def negative_pivots(self) -> int | None:
         """Negative pivots of the tangent, counted when first asked for: 0 is stable, None is not known."""

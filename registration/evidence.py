@@ -7,7 +7,7 @@ both scales with wide log-normal priors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,10 @@ class Scale:
     def __post_init__(self) -> None:
         if not (0.0 < self.median < np.inf and 0.0 <= self.spread < np.inf and 0.0 <= self.least < np.inf):
             raise ValueError(f"Scale: expected a positive median, a spread and a least value of 0 or more, got {self}.")
+
+    def at_least(self, least: float) -> Scale:
+        """The same belief with a larger least value."""
+        return replace(self, least=max(self.least, least))
 
     def grid(self) -> tuple[Floats, Floats]:
         """Logarithms of values, multiples of one step, (g,), and the logarithm of their probability, (g,)."""
@@ -66,8 +70,19 @@ class Linearised:
     rest: float
     count: float
 
+    def promised(self, scales: Scales, coefficients: Floats) -> float:
+        """Root mean square change of the residuals by the best step at some scales, metres.
 
-def linearise(
+        Args:
+            scales: noise and force scale.
+            coefficients: at the state, (k,).
+        """
+        best = self.projections / (self.information + (scales.noise / scales.force) ** 2)
+        step = best - self.vectors.T @ coefficients
+        return float(np.sqrt(self.information @ step**2 / max(self.count, 1.0)))
+
+
+def linearised(
     jacobian: Floats, residuals: Floats, weights: Floats, coefficients: Floats, consistency: float
 ) -> Linearised:
     """The linear problem about a state.

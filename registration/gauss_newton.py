@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.reference.outcome import NotConverged
 
-from .evidence import Scales, find_scales, linearise
+from .evidence import Scales, find_scales, linearised
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .posterior import Posterior, posterior
@@ -67,13 +67,16 @@ class GaussNewton:
     """Trust-region Gauss-Newton on a robust loss.
 
     The losses are taken one after the other: a convex one first, so that a part of the organ that has moved far is not
-    mistaken for outliers. Within each, scales are found anew from every linearisation; the noise falls with the
-    residual, so that a far start does not overfit its way.
+    mistaken for outliers. Within each, scales are found anew from every linearisation. What a linear model promises to
+    change holds only in part: the noise is taken as at least that part of it, so that a far start does not overfit its
+    way into a wrong minimum.
 
     Args:
         losses: one after the other.
         max_iterations: of all losses together.
         settled: a step shorter than this, in posterior deviations a coefficient, is not taken: it has converged.
+        handed_on: the same for all losses but the last.
+        graduation: the noise is taken as at least this part of what the linear model promises to change.
         max_step: first limit on the movement of any observed node in one step, metres.
         least_step: no step that moves all observed nodes less than this is tried, metres.
     """
@@ -81,58 +84,63 @@ class GaussNewton:
     losses: tuple[Loss, ...] = (Huber(), Tukey())
     max_iterations: int = 40
     settled: float = 0.1
+    handed_on: float = 0.5
+    graduation: float = 0.5
     max_step: float = 8e-3
     least_step: float = 1e-6
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
             raise ValueError(f"GaussNewton.max_iterations: expected at least 1, got {self.max_iterations}.")
-        for name in ("settled", "max_step", "least_step"):
+        for name in ("settled", "handed_on", "max_step", "least_step"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"GaussNewton.{name}: expected a positive number, got {getattr(self, name)}.")
 
-    def solve(self, problem: Problem, start: Floats) -> Found:
+    def rough(self) -> GaussNewton:
+        """The same with the first loss alone, ended early: for a start."""
+        return replace(self, losses=self.losses[:1], settled=self.handed_on)
+
+    def solve(self, problem: Problem, start: Floats, near: Trial | None = None) -> Found:
         """The coefficients that minimise the robust distance plus the prior.
 
         Args:
             problem: what is registered.
             start: coefficients to start from, (k,).
+            near: a trial whose state is near the start's.
 
         Raises:
             NotConverged: the model found no state at the start.
         """
-        return _Search(self, problem, start).run()
+        return _Search(self, problem, start, near).run()
 
 
 class _Search:
     """One run of the solver: where it is, how far it may step, what it has seen."""
 
-    def __init__(self, options: GaussNewton, problem: Problem, start: Floats) -> None:
+    def __init__(self, options: GaussNewton, problem: Problem, start: Floats, near: Trial | None) -> None:
         self.options, self.problem = options, problem
-        self.trial = problem.trial(start)
+        self.trial = problem.trial(start, near, anew=True)
         self.evaluations, self.limit = 1, options.max_step
         self.noise = max(robust_deviation(self.trial.match.distances), problem.noise.least)
         self.trace: list[Step] = []
 
     def run(self) -> Found:
-        outcome = Outcome.MOST_ITERATIONS
-        for loss in self.options.losses:
-            outcome = self._descend(loss)
-            if outcome is Outcome.MOST_ITERATIONS:
-                break
+        for loss in self.options.losses[:-1]:
+            self._descend(loss, self.options.handed_on)
+        outcome = self._descend(self.options.losses[-1], self.options.settled)
         local = self._local(self.options.losses[-1])
         return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
 
     def _local(self, loss: Loss) -> LocalModel:
-        local = LocalModel(self.problem, self.trial, loss, self.noise)
+        local = LocalModel(self.problem, self.trial, loss, self.noise, self.options.graduation)
         self.noise = local.scales.noise
         return local
 
-    def _descend(self, loss: Loss) -> Outcome:
+    def _descend(self, loss: Loss, settled: float) -> Outcome:
         while len(self.trace) < self.options.max_iterations:
             local = self._local(loss)
             length = local.length
-            if length < self.options.settled and not local.is_graduated:
+            if length < settled and not local.is_graduated:
                 again = self.problem.again(self.trial)
                 if np.array_equal(again.match.triangles, self.trial.match.triangles):
                     return Outcome.CONVERGED
@@ -186,44 +194,48 @@ class LocalModel:
         trial: where.
         loss: of the points.
         noise: their scale so far, metres, for the weights that the scales are found with.
+        graduation: the noise is taken as at least this part of what the linear model promises to change.
     """
 
-    def __init__(self, problem: Problem, trial: Trial, loss: Loss, noise: float) -> None:
+    def __init__(self, problem: Problem, trial: Trial, loss: Loss, noise: float, graduation: float = 0.0) -> None:
         self.problem, self.trial = problem, trial
         distances = trial.match.distances
         self.jacobian = problem.jacobian(trial)
-        self.weights = loss.weight(distances / noise)
-        self.scales = self._found_scales(loss)
-        # The linear model promises a small residual; until it is met, the noise is taken as a tenth of what there is.
-        self.noise = max(self.scales.noise, 0.1 * robust_deviation(distances))
-        self.is_graduated = self.noise > 1.2 * self.scales.noise
+        weights = loss.weight(distances / noise)
+        self.scales, self.is_graduated = self._found_scales(loss, weights, graduation)
+        self.noise = self.scales.noise
         self.weights = loss.weight(distances / self.noise)
         self.precision = np.ones(problem.size)
         self.precision[problem.force_part] = 1.0 / self.scales.force**2
-        self.information = self.jacobian.T @ (self.weights[:, None] * self.jacobian)
+        self.information = self.jacobian.T @ (weights[:, None] * self.jacobian)
         self._hessian = self.information / self.noise**2 + np.diag(self.precision)
         self.gradient = self.jacobian.T @ (self.weights * distances) / self.noise**2
         self.gradient += self.precision * trial.coefficients
         self._values, self._vectors = np.linalg.eigh(self._scaled(self._hessian))
         self.value = self.objective(trial, loss)
 
-    def _found_scales(self, loss: Loss) -> Scales:
-        problem, weights = self.problem, self.weights
+    def _found_scales(self, loss: Loss, weights: Floats, graduation: float) -> tuple[Scales, bool]:
+        """Scales, and whether the noise is held above what the linear model alone would believe."""
+        problem = self.problem
         jacobian, residuals = self.jacobian[:, problem.force_part], self.trial.match.distances
         if problem.pose is not None:
-            jacobian, residuals, weights = self._without_pose(jacobian, residuals, weights)
+            jacobian, residuals = self._without_pose(jacobian, residuals, weights)
         coefficients = self.trial.coefficients[problem.force_part]
-        local = linearise(jacobian, residuals, weights, coefficients, loss.consistency)
-        return find_scales(local, problem.noise, problem.forces.scale)
+        local = linearised(jacobian, residuals, weights, coefficients, loss.consistency)
+        scales = find_scales(local, problem.noise, problem.forces.scale)
+        least = graduation * local.promised(scales, coefficients)
+        if least <= scales.noise:
+            return scales, False
+        return find_scales(local, problem.noise.at_least(least), problem.forces.scale), True
 
-    def _without_pose(self, jacobian: Floats, residuals: Floats, weights: Floats) -> tuple[Floats, Floats, Floats]:
+    def _without_pose(self, jacobian: Floats, residuals: Floats, weights: Floats) -> tuple[Floats, Floats]:
         """The linear problem with what a pose can explain projected out."""
         root = np.sqrt(weights)
         turned = np.linalg.qr(root[:, None] * self.jacobian[:, self.problem.forces.size :])[0]
         inner, rest = root[:, None] * jacobian, root * residuals
         inner, rest = inner - turned @ (turned.T @ inner), rest - turned @ (turned.T @ rest)
         safe = np.maximum(root, 1e-9)
-        return inner / safe[:, None], rest / safe, weights
+        return inner / safe[:, None], rest / safe
 
     def _scaled(self, matrix: Floats) -> Floats:
         """In coefficients of unit prior variance: forces in newtons and poses differ by orders of size."""

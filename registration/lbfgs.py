@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,23 +44,28 @@ class LBFGS:
                 f"LBFGS.max_iterations, LBFGS.memory: expected at least 1, got {self.max_iterations} and {self.memory}."
             )
 
-    def solve(self, problem: Problem, start: Floats) -> Found:
+    def rough(self) -> LBFGS:
+        """The same with the first loss alone: for a start."""
+        return replace(self, losses=self.losses[:1])
+
+    def solve(self, problem: Problem, start: Floats, near: Trial | None = None) -> Found:
         """The coefficients that minimise the robust distance plus the prior.
 
         Args:
             problem: what is registered.
             start: coefficients to start from, (k,).
+            near: a trial whose state is near the start's.
 
         Raises:
             NotConverged: the model found no state at the start.
         """
-        return _Run(self, problem, start).found()
+        return _Run(self, problem, start, near).found()
 
 
 class _Run:
-    def __init__(self, options: LBFGS, problem: Problem, start: Floats) -> None:
+    def __init__(self, options: LBFGS, problem: Problem, start: Floats, near: Trial | None) -> None:
         self.options, self.problem = options, problem
-        self.trial = self.best = problem.trial(start)
+        self.trial = self.best = problem.trial(start, near, anew=True)
         self.evaluations, self.trace = 1, list[Step]()
 
     def found(self) -> Found:

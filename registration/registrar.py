@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.meshes.clouds import check_cloud
 
 from .evidence import Scale
-from .forward import ForwardModel, State, reduce_model
+from .forward import ForwardModel, ReducedModel, State, reduce_model
 from .gauss_newton import Found, GaussNewton, Step
 from .lbfgs import LBFGS
 from .outcome import Outcome
@@ -25,6 +25,8 @@ from .unknowns import Forces, PosePrior
 from .verdict import Expectations, Judgement, judge
 
 Floats = NDArray[np.float64]
+_LEADING = 6  # directions of force that a cold start begins with
+NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class RegistrationOptions:
         most_points: larger clouds are thinned to so many points.
     """
 
-    noise: Scale = Scale(5e-4, 1.5, least=2e-5)
+    noise: Scale = NOISE
     solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
     most_points: int = 1000
 
@@ -125,6 +127,8 @@ class Registrar:
         self.options = options or RegistrationOptions()
         self.expectations = expectations or Expectations.of(model, self.options.noise)
         self._reduced = reduce_model(model, observed.nodes, forces.basis)
+        self._leading_forces = forces.leading(_LEADING)
+        self._leading = reduce_model(model, observed.nodes, self._leading_forces.basis)
 
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud.
@@ -139,10 +143,29 @@ class Registrar:
         """
         begin = time.perf_counter()
         points = self._checked(cloud)
-        problem = Problem(self._reduced, self.observed, self.forces, self.pose, points, self.options.noise)
-        first = np.zeros(problem.size) if start is None else start.coefficients
-        found = self.options.solver.solve(problem, first)
+        problem = self._problem(points, self._reduced, self.forces)
+        if start is None:
+            found = self._cold(problem)
+        else:
+            found = self.options.solver.solve(problem, start.coefficients)
         return self._result(problem, found, begin)
+
+    def _problem(self, points: Floats, model: ReducedModel, forces: Forces) -> Problem:
+        return Problem(model, self.observed, forces, self.pose, points, self.options.noise)
+
+    def _cold(self, problem: Problem) -> Found:
+        """From rest: first with the leading directions alone, which cannot fold the surface into a wrong minimum."""
+        first, solver = self._leading_forces, self.options.solver
+        start, near, spent = np.zeros(problem.size), None, 0
+        trace: tuple[Step, ...] = ()
+        if first.size < self.forces.size:
+            rough = self._problem(problem.cloud, self._leading, first)
+            begun = solver.rough().solve(rough, np.zeros(rough.size))
+            near, spent, trace = begun.trial, begun.evaluations, begun.trace
+            start[: first.size] = near.coefficients[: first.size]
+            start[self.forces.size :] = near.coefficients[first.size :]
+        found = solver.solve(problem, start, near)
+        return replace(found, evaluations=found.evaluations + spent, trace=trace + found.trace)
 
     def _checked(self, cloud: ArrayLike) -> Floats:
         points = np.asarray(cloud, dtype=np.float64)

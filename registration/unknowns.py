@@ -49,6 +49,10 @@ class Forces:
         """Nodal forces, (n, 3), newtons."""
         return (self.basis @ coefficients).reshape(-1, 3)
 
+    def leading(self, count: int) -> Forces:
+        """The first directions alone: those that move the observed side most, where they were reduced."""
+        return replace(self, basis=self.basis[:, :count])
+
     @property
     def net_basis(self) -> Floats:
         """Net force of each coefficient, (3, k)."""

@@ -273,7 +273,7 @@ class ReducedSurrogateState:
         return _tangent(self._model.surrogate.core, self._record, self._model.encode)
 
     def jacobian(self, rows: csr_array) -> Floats:
-        """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p): no others are touched."""
+        """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p); no more is touched."""
         return rows @ self._model.linear_rows + (rows @ self._model.decode_rows) @ self._tangent
 
     def moved(self, change: Floats) -> Floats:

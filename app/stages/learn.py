@@ -10,6 +10,7 @@ import numpy as np
 from softtwin.meshes.files import read_body
 from softtwin.meshes.metrics import nodal_distances
 from softtwin.reference.dataset import DataSet
+from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.predictor import Surrogate, load, save
 from softtwin.surrogate.train import TrainingPlan, train
@@ -34,7 +35,8 @@ def train_stage(space: Workspace) -> Surrogate:
         seed=section.seed,
     )
     with timed(space, "train"):
-        surrogate = train(DataSet(space.data), plan, space.training)
+        data = DataSet(space.data)
+        surrogate = with_domain(train(data, plan, space.training), data)
         save(surrogate, space.twin)
     shutil.copyfile(space.body, space.twin / "body.vtu")
     (space.twin / "organ.toml").write_text(to_toml(space.config))
@@ -66,7 +68,7 @@ def _write_predictions(space: Workspace, surrogate: Surrogate, data: DataSet) ->
     for i, loads in enumerate(samples.forces):
         forces = np.zeros_like(data.body.points)
         forces[data.response.loaded] = loads
-        predicted[i] = surrogate.solve(forces)
+        predicted[i] = surrogate.solve(forces).displacement
     errors = nodal_distances(predicted, samples.displacements).mean(axis=1)
     order = np.argsort(errors)
     shown = order[[len(order) // 2, -1]]
