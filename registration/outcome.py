@@ -14,6 +14,11 @@ class Outcome(Enum):
     MOST_ITERATIONS = "most iterations reached"
 
     @property
+    def is_success(self) -> bool:
+        """True for convergence alone."""
+        return self is Outcome.CONVERGED
+
+    @property
     def advice(self) -> str:
         """What to try."""
         return _ADVICE[self]
