@@ -188,6 +188,28 @@ def test_an_impatient_model_refuses_without_load_steps(box: Body) -> None:
             model.solve(-1e4 * tip_force(box)[:, [2, 0, 1]], near=state)
 
 
+@pytest.mark.liver
+@pytest.mark.parametrize("name", ["s1", "s2", "s3"])
+def test_a_tool_that_lets_go_of_the_liver_and_takes_it_again_is_no_long_way(liver_folder, name: str) -> None:
+    """Counted in factorisations: 15 to 55 where the tangent alone decides."""
+    from liver import POISSON_RATIO, YOUNG_MODULUS, liver, sequence
+
+    data, body = sequence(name), liver()
+    forces = np.zeros_like(body.points)
+    forces[data.tool] = data.net_forces[49] / len(data.tool)
+    options = NewtonOptions(tolerance=1e-5, max_iterations=15)
+    with Problem(body, NeoHookean(YOUNG_MODULUS, POISSON_RATIO), options) as problem:
+        model = ReferenceModel(problem, patient=False)
+        pulled = model.solve(forces)
+        released = model.solve(0.0 * forces, near=pulled)
+        again = model.solve(forces, near=released)
+        halved = model.solve(0.5 * forces, near=pulled)
+    assert released.equilibrium.iterations == 0
+    for state in (again, halved):
+        assert state.equilibrium.factorisations <= 10 and state.equilibrium.load_steps == 1
+    np.testing.assert_allclose(again.displacement, data.positions[49] - body.points, atol=1e-5)
+
+
 @pytest.mark.parametrize("shape", [(3,), (81, 1), (2, 4, 3)])
 def test_cotangents_of_another_shape_are_refused(box: Body, shape: tuple[int, ...]) -> None:
     with Problem(box, NeoHookean(5000.0, 0.4)) as problem:
