@@ -188,6 +188,14 @@ def test_an_impatient_model_refuses_without_load_steps(box: Body) -> None:
             model.solve(-1e4 * tip_force(box)[:, [2, 0, 1]], near=state)
 
 
+def test_a_state_of_another_material_has_no_derivatives_here(box: Body) -> None:
+    with Problem(box, NeoHookean(5000.0, 0.4)) as problem:
+        state = ReferenceModel(problem).solve(tip_force(box))
+        problem.set_material(NeoHookean(6000.0, 0.4))
+        with pytest.raises(RuntimeError, match=r"expected the material that it was found with.*solve again"):
+            state.pull(state.displacement)
+
+
 @pytest.mark.liver
 @pytest.mark.parametrize("name", ["s1", "s2", "s3"])
 def test_a_tool_that_lets_go_of_the_liver_and_takes_it_again_is_no_long_way(liver_folder, name: str) -> None:
