@@ -109,7 +109,9 @@ class TrainingSection(_Section):
     )
     modes: Count = Field(64, description="displacement modes (POD) of the reduced network")
     width: Count = Field(256, description="width of its blocks")
-    seconds: Positive = Field(120.0, description="wall time to train: ends with the step under way; reading the data not counted")
+    seconds: Positive = Field(
+        120.0, description="wall time to train: ends with the step under way; reading the data not counted"
+    )
     seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
 
 

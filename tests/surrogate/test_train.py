@@ -154,7 +154,7 @@ def test_a_polite_kill_ends_the_program_and_leaves_a_whole_checkpoint(
 def test_training_ends_with_the_step_under_way_when_the_time_is_over(
     data: DataSet, small_plan: TrainingPlan, ticks: tuple[float, ...], latest: float, fewest: int, most: int
 ) -> None:
-    """Where the machine becomes busy fewer steps are made; over the time go the step under way and the look after it."""
+    """Where the machine becomes busy fewer steps are made; the step under way and the look after it are the last."""
     told = train(data, replace(small_plan, epochs=None, seconds=10.0), clock=Ticking(*ticks)).card["training"]
     assert 10.0 <= told["seconds"] <= latest
     assert fewest <= told["steps"] <= most
