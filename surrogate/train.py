@@ -456,10 +456,13 @@ def _read_checkpoint(path: Path, plan: TrainingPlan, mark: str) -> dict[str, Any
     if differing:
         raise CheckpointError(
             f"train.folder: {path} belongs to another plan (differs in {', '.join(differing)}); choose another folder, "
-            "or the plan it was made with to go on."
+            "the plan it was made with to go on, or train from the start (`softtwin train --fresh`)."
         )
     if course["data"] != mark:
-        raise CheckpointError(f"train.folder: {path} belongs to another data set; choose another folder.")
+        raise CheckpointError(
+            f"train.folder: {path} belongs to another data set; choose another folder, or train "
+            "from the start (`softtwin train --fresh`)."
+        )
     return course
 
 
@@ -488,6 +491,7 @@ def _card(data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], course:
         "data": {
             "path": str(data.path),
             "fingerprint": course.mark,
+            "identity": data.identity,
             "versions": data.header.get("versions", {}),
             "plan": data.header.get("plan", {}),
         },
