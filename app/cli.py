@@ -255,6 +255,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors of the input are one message and exit code 2, not a traceback."""
     # Ranks are the parallelism: on meshes of an organ's size several BLAS threads in one process only wait for another.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Threads that spin while they wait made training 14 times slower on two cores that others used as well.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         with warnings.catch_warnings(), threadpool_limits(int(os.environ["OPENBLAS_NUM_THREADS"]), "blas"):
             warnings.showwarning = _show_warning

@@ -122,6 +122,7 @@ class TrainingSection(_Section):
     seconds: Positive = Field(
         120.0, description="wall time to train: ends with the step under way; reading the data not counted"
     )
+    epochs: int = Field(0, ge=0, description="passes over the samples instead, whatever time they take; 0: by seconds")
     seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
 
 

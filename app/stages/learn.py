@@ -40,6 +40,7 @@ def train_stage(space: Workspace, fresh: bool = False) -> Surrogate:
         modes=section.modes,
         width=section.width,
         seconds=section.seconds,
+        epochs=section.epochs or None,
         seed=section.seed,
     )
     with timed(space, "train", train_inputs(space, data)):
