@@ -55,8 +55,8 @@ def prepare(config: Config, output: Path, again: bool = False) -> Workspace:
         ConfigError: equilibria were solved there with another configuration or other files.
     """
     output.mkdir(parents=True, exist_ok=True)
-    data = solved_data(Workspace(config, output))
-    if data is not None and not again:
+    data = None if again else solved_data(Workspace(config, output))
+    if data is not None:
         _refuse_changes(Workspace(config, output), data)
     write_whole(output / "organ.toml", to_toml(config))
     return open_workspace(output / "organ.toml")

@@ -10,7 +10,7 @@ from typing import Any
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_body
-from softtwin.reference.dataset import DataSet, DataSetError, differences
+from softtwin.reference.dataset import DataSet, DataSetError, differences, existing
 from softtwin.reference.loads import LoadPlan
 
 from .config import Config, ConfigError
@@ -124,12 +124,13 @@ def current_data(space: Workspace) -> tuple[DataSet, Body]:
 
 
 def solved_data(space: Workspace) -> DataSet | None:
-    """The data set if any of its equilibria were solved, whether or not they are still wanted."""
-    try:
-        data = DataSet(space.data)
-    except DataSetError:
-        return None
-    return data if len(data.missing_blocks()) < data.block_count else None
+    """The data set if any of its equilibria were solved, whether or not they are still wanted.
+
+    Raises:
+        DataSetError: it cannot be read, though blocks of it were solved.
+    """
+    data = existing(space.data)
+    return data if data is not None and len(data.missing_blocks()) < data.block_count else None
 
 
 def check_trained(space: Workspace, data: DataSet) -> None:

@@ -393,6 +393,20 @@ def differences(data: DataSet, body: Body, plan: Mapping[str, Any]) -> list[str]
     return found + _plan_differences(data.header["plan"], plan)
 
 
+def existing(path: Path) -> DataSet | None:
+    """The data set in a folder; None where there is none, or one that was interrupted before its header was written.
+
+    Raises:
+        DataSetError: it cannot be read, though blocks of it were solved.
+    """
+    try:
+        return DataSet(path)
+    except DataSetError:
+        if any((path / "samples" / "checksum").glob("c/*")):
+            raise
+        return None
+
+
 def _described(body: Body) -> str:
     return f"{len(body.points)} nodes, fingerprint {body.fingerprint[:12]}"
 

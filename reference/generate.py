@@ -27,7 +27,17 @@ from tqdm import tqdm
 
 from softtwin.meshes.body import Body
 
-from .dataset import SPLITS, DataSet, DataSetError, LinearResponse, create, differences, drop_block, write_block
+from .dataset import (
+    SPLITS,
+    DataSet,
+    DataSetError,
+    LinearResponse,
+    create,
+    differences,
+    drop_block,
+    existing,
+    write_block,
+)
 from .equilibrium import NewtonOptions, Problem
 from .fenicsx import MPI, PETSc, dolfinx
 from .loads import LoadPlan, check_loads, draw_load, loaded_nodes
@@ -41,6 +51,7 @@ Floats = NDArray[np.float64]
 _EXACT_COLUMNS = 1500  # up to so many loaded unknowns the linear response is kept whole
 _RANK = 512  # else its best approximation of this rank: 0.04 % of the displacement on the beam
 _PILOTS = 9
+_PATIENCE_S = 20.0  # ranks live on for a moment when their mpirun is killed
 _BEYOND = 2.0  # draws that move more than twice the wanted top are kept apart
 
 
@@ -147,7 +158,7 @@ def generate(
 def _locked(path: Path) -> Iterator[None]:
     """Keep others from writing the same data set; the system lets go of the lock when the process ends in any way."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(path.with_name(f".{path.name}.lock"), timeout=0)
+    lock = FileLock(path.with_name(f".{path.name}.lock"), timeout=_PATIENCE_S)
     try:
         lock.acquire()
     except Timeout:
@@ -177,7 +188,7 @@ def _solve(path: Path, blocks: list[int], comm: Any) -> None:
 def _prepare(path: Path, body: Body, plan: Plan, redo: Sequence[int], again: bool) -> list[int]:
     """Make the data set where there is none; returns the numbers of the blocks to solve."""
     check_loads(body, plan.loads)
-    present = None if again else _present(path)
+    present = None if again else existing(path)
     if present is not None and not _is_another(present, body, plan):
         return _unfinished(present, redo)
     if redo:
@@ -194,14 +205,6 @@ def _prepare(path: Path, body: Body, plan: Plan, redo: Sequence[int], again: boo
         "versions": versions(),
     }
     return create(path, header, body, response, modes.shapes, modes.eigenvalues).missing_blocks()
-
-
-def _present(path: Path) -> DataSet | None:
-    """The data set that is there; None where it was interrupted before its header was written."""
-    try:
-        return DataSet(path)
-    except DataSetError:
-        return None
 
 
 def _unfinished(present: DataSet, redo: Sequence[int]) -> list[int]:

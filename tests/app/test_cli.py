@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 import warnings
 from pathlib import Path
@@ -279,6 +280,15 @@ def test_what_the_system_refuses_is_one_message(capsys, monkeypatch, error: Exce
     monkeypatch.setattr(doctor, "checks", refused)
     said = run(capsys, "doctor", code=2)
     assert said.startswith("error: ") and message in said and len(said.splitlines()) == 1
+
+
+def test_threads_wait_without_spinning(capsys, monkeypatch) -> None:
+    from softtwin.app import doctor
+
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    monkeypatch.setattr(doctor, "checks", list)
+    run(capsys, "doctor")
+    assert os.environ["OMP_WAIT_POLICY"] == "passive"
 
 
 @pytest.mark.parametrize("place", ["taken", "taken/within"])

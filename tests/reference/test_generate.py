@@ -195,10 +195,13 @@ def test_options_that_came_later_had_their_defaults_before(undisturbed: DataSet,
         generate(path, body(), replace(PLAN, newton=NewtonOptions(max_load_steps=3)))
 
 
-def test_two_do_not_write_one_data_set(undisturbed: DataSet, tmp_path: Path) -> None:
+def test_two_do_not_write_one_data_set(undisturbed: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lock is the system's: it goes with the process that holds it, even where that is killed."""
+    from softtwin.reference import generate as farm
+
     path = tmp_path / "data.zarr"
     shutil.copytree(undisturbed.path, path)
+    monkeypatch.setattr(farm, "_PATIENCE_S", 0.1)
     program = (
         "import pathlib, sys, time; from softtwin.reference.generate import _locked\n"
         "with _locked(pathlib.Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
@@ -318,6 +321,15 @@ def test_the_identity_is_that_of_the_samples(undisturbed: DataSet, tmp_path: Pat
 def test_a_header_that_was_never_written_is_no_data_set(tmp_path: Path) -> None:
     with pytest.raises(DataSetError, match=r"expected a Zarr 3 data set .*`softtwin generate`"):
         DataSet(tmp_path / "nothing.zarr")
+
+
+def test_a_lost_header_does_not_cost_what_was_solved(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    (path / "zarr.json").write_text("{")
+    with pytest.raises(DataSetError, match="cannot be read"):
+        generate(path, body(), PLAN)
+    assert len(list((path / "samples" / "checksum" / "c").iterdir())) == undisturbed.block_count
 
 
 def test_a_full_disk_keeps_what_was_whole(undisturbed: DataSet, tmp_path: Path, monkeypatch) -> None:
