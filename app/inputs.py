@@ -133,13 +133,23 @@ def solved_data(space: Workspace) -> DataSet | None:
     return data if data is not None and len(data.missing_blocks()) < data.block_count else None
 
 
-def check_trained(space: Workspace, data: DataSet) -> None:
+def check_trained(space: Workspace, data: DataSet, card: Mapping[str, Any]) -> None:
     """Refuse a twin that was trained otherwise than the configuration says, or on other data.
+
+    Args:
+        space: the workspace.
+        data: its data set.
+        card: the twin's, which answers for its data where the stage left no record.
 
     Raises:
         ConfigError: what has changed since.
     """
     changed = changes(space, "train", train_inputs(space, data))
+    if changed is None:
+        learned = card.get("data", {}).get("identity", data.identity)
+        changed = (
+            [] if learned == data.identity else [f"data set ({learned[:12]}... then, {data.identity[:12]}... now)"]
+        )
     if changed:
         raise ConfigError(
             f"{space.twin} was trained on something else: {'; '.join(changed)}. Run `softtwin train` again."

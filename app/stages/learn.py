@@ -63,7 +63,7 @@ def validate_stage(space: Workspace) -> str:
     """
     data, body = current_data(space)
     surrogate = load(space.twin, body)
-    check_trained(space, data)
+    check_trained(space, data, surrogate.card)
     with timed(space, "validate", validate_inputs(space, data)):
         evaluation = evaluate(surrogate, data)
         _write_predictions(space, surrogate, data)

@@ -199,6 +199,15 @@ def test_validation_refuses_a_twin_of_another_training(capsys, copy: Path) -> No
     assert "training.width (16 then, 24 now)" in said and "Run `softtwin train` again" in said
 
 
+def test_the_card_answers_for_its_data_without_a_record(capsys, copy: Path) -> None:
+    (copy / "stages.json").unlink()
+    run(capsys, "validate", copy / "organ.toml")
+    edit(copy, "seed = 0 # seed of everything", "seed = 3 # seed of everything")
+    run(capsys, "generate", copy / "organ.toml", "--again")
+    said = run(capsys, "validate", copy / "organ.toml", code=2)
+    assert "data set (" in said and "Run `softtwin train` again" in said
+
+
 def test_a_twin_whose_material_was_edited_is_refused(capsys, copy: Path) -> None:
     edit(copy / "twin", "young_modulus = 5000.0", "young_modulus = 7000.0")
     np.save(copy / "cloud.npy", read_body(copy / "body.vtu").points)
