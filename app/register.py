@@ -27,7 +27,7 @@ from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import Informed, informed, nodal_forces
 
 from .config import Config, ConfigError, RegistrationSection, read_config
-from .stages.generate import load_plan
+from .inputs import check_material, load_plan
 
 Floats = NDArray[np.float64]
 NOTICE = "Research software: not a medical device."
@@ -39,13 +39,14 @@ def open_twin(folder: Path | str) -> tuple[Body, Config]:
     """The body and the configuration of a twin.
 
     Raises:
-        ConfigError: the folder is no twin.
+        ConfigError: the folder is no twin, or its material is not the one that its surrogate has learned.
     """
     folder = Path(folder)
     missing = [name for name in ("body.vtu", "organ.toml") if not (folder / name).is_file()]
     if missing:
         raise ConfigError(f"twin: expected a twin folder with {missing} in {folder}; make one with `softtwin build`.")
     config, _ = read_config(folder / "organ.toml")
+    check_material(folder, config)
     return read_body(folder / "body.vtu"), config
 
 

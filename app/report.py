@@ -29,7 +29,7 @@ from softtwin.registration.residuals import SurfaceDistance
 from .config import Config, to_toml
 from .pictures import DISPLACEMENT, ORGAN, Layer, Picture, Studio, camera_side, chart, rendering_problem, view_of
 from .register import NOTICE
-from .workspace import Workspace
+from .workspace import Workspace, read_records
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -469,8 +469,7 @@ def _compared(found: Sequence[_State], targets: Mapping[str, Embedding]) -> Sect
 
 def record_section(space: Workspace, studio: Studio) -> Section:
     """What it takes to make the same again: configuration, versions, times, the twin's card."""
-    times, card = space.folder / "stages.json", space.twin / "surrogate.json"
-    stages = json.loads(times.read_text()) if times.exists() else {}
+    stages, card = read_records(space.folder), space.twin / "surrogate.json"
     return {
         "stages": stages,
         "total": sum(stage["seconds"] for stage in stages.values()),

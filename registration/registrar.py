@@ -187,23 +187,28 @@ class Registrar:
         return Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.options.noise)
 
     def _cold(self, points: Floats, begin: float) -> Registration:
-        """From rest: first the leading directions alone, which cannot fold the surface into a wrong minimum."""
-        solver = self.options.solver
-        prepared, evaluations, trace = self._leading, 0, list[Step]()
-        problem = self._problem(points, prepared)
-        start, near = np.zeros(problem.size), None
-        following = [self._everywhere] if self.forces.size > prepared.forces.size else []
-        for i in range(len(following) + self.options.rounds):
-            found = solver.rough().solve(problem, start, near)
-            evaluations, trace = evaluations + found.evaluations, [*trace, *found.trace]
-            before, near = prepared.forces, found.trial
-            nodal = before.forces(near.coefficients[: before.size])
-            prepared = following[i] if i < len(following) else self._gathered(nodal)
-            problem = self._problem(points, prepared)
-            start = np.concatenate([prepared.forces.fitted(nodal), near.coefficients[before.size :]])
-        found = solver.solve(problem, start, near)
-        found = replace(found, evaluations=found.evaluations + evaluations, trace=(*trace, *found.trace))
-        return self._result(problem, found, prepared, begin)
+        """From rest; where the place of the forces is unknown, once more from rest for each round of gathering them."""
+        prepared = self._everywhere
+        found = self._from_rest(points, prepared, self._leading)
+        for _ in range(self.options.rounds):
+            inner = found.trial.coefficients[: prepared.forces.size]
+            prepared = self._gathered(prepared.forces.forces(inner))
+            spent, found = found, self._from_rest(points, prepared)
+            found = _after(spent, found)
+        return self._result(self._problem(points, prepared), found, prepared, begin)
+
+    def _from_rest(self, points: Floats, prepared: Prepared, leading: Prepared | None = None) -> Found:
+        """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
+        problem, solver = self._problem(points, prepared), self.options.solver
+        start = np.zeros(problem.size)
+        if prepared.forces.size <= _LEADING:
+            return solver.solve(problem, start)
+        first = leading or Prepared.of(self.model, self.observed, prepared.forces.leading(_LEADING))
+        rough = self._problem(points, first)
+        begun = solver.rough().solve(rough, np.zeros(rough.size))
+        start[:_LEADING] = begun.trial.coefficients[:_LEADING]
+        start[prepared.forces.size :] = begun.trial.coefficients[_LEADING:]
+        return _after(begun, solver.solve(problem, start, begun.trial))
 
     def _gathered(self, nodal: Floats) -> Prepared:
         """The unknown forces once more, where forces were found."""
@@ -251,6 +256,11 @@ class Registrar:
             seconds=time.perf_counter() - begin,
             trace=found.trace,
         )
+
+
+def _after(first: Found, second: Found) -> Found:
+    """The second result, with what the first took."""
+    return replace(second, evaluations=first.evaluations + second.evaluations, trace=(*first.trace, *second.trace))
 
 
 def register_sequence(registrar: Registrar, clouds: Iterable[ArrayLike]) -> Iterator[Registration]:

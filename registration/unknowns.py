@@ -33,7 +33,7 @@ class Forces:
         scale: what is believed of the coefficients' standard deviation, newtons.
         left_out: covariance of the net force of directions that were left out, for unit scale, (3, 3).
         every: the basis before any direction was left out, (3n, m).
-        where: part of its expected size that a force at each node may have, (n,); 1 where nothing is known of the place.
+        where: part of its expected size that a force at each node may have, (n,); None for the whole of it.
     """
 
     nodes: Ints
@@ -56,12 +56,6 @@ class Forces:
     def forces(self, coefficients: Floats) -> Floats:
         """Nodal forces, (n, 3), newtons."""
         return (self.basis @ coefficients).reshape(-1, 3)
-
-    def fitted(self, nodal: Floats) -> Floats:
-        """Coefficients whose forces are nearest to given nodal forces (n, 3), (k,)."""
-        rows = (3 * self.nodes[:, None] + np.arange(3)).ravel()
-        found: Floats = np.linalg.lstsq(self.basis[rows], nodal[self.nodes].ravel(), rcond=1e-6)[0]
-        return found
 
     def leading(self, count: int) -> Forces:
         """The first directions alone: those that move the observed side most, where they were reduced."""
