@@ -157,7 +157,8 @@ class Registrar:
     ) -> None:
         self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
         self.options = options or RegistrationOptions()
-        self.expectations = expectations or Expectations.of(model, self.options.noise)
+        self.noise = self.options.noise.at_least(model.error)  # points tell no more than the model can meet
+        self.expectations = expectations or Expectations.of(model, self.noise)
         self._everywhere = Prepared.of(model, observed, forces)
         self._leading = Prepared.of(model, observed, forces.leading(_LEADING))
 
@@ -184,7 +185,7 @@ class Registrar:
         return result
 
     def _problem(self, points: Floats, prepared: Prepared) -> Problem:
-        return Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.options.noise)
+        return Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.noise)
 
     def _cold(self, points: Floats, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more from rest for each round of gathering them."""
@@ -219,7 +220,7 @@ class Registrar:
 
     def _has_left(self, result: Registration, start: Registration) -> bool:
         """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
-        return result.noise > _LEFT * max(start.noise, self.options.noise.least)
+        return result.noise > _LEFT * max(start.noise, self.noise.least)
 
     def _checked(self, cloud: ArrayLike) -> Floats:
         points = np.asarray(cloud, dtype=np.float64)
