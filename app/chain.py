@@ -63,6 +63,7 @@ def make_twin(space: Workspace, path: Path, say: Callable[[str], None]) -> None:
     say(f"1/4 mesh: {space.config.body.source}")
     body = read_body(space.body) if space.body.exists() else mesh_stage(space)
     say(f"    {len(body.points)} nodes, {len(body.cells)} cells, {len(body.fixed)} fixed, {1e3 * body.volume:.2f} l")
+    say(_indented((space.folder / "mesh_quality.txt").read_text()))
     say("2/4 generate: eigenmodes, modal loads, equilibria")
     if _complete(space):
         say(f"    there already: {describe_data(DataSet(space.data))}")
@@ -72,6 +73,10 @@ def make_twin(space: Workspace, path: Path, say: Callable[[str], None]) -> None:
     train_stage(space)
     say("4/4 validate: held-out errors")
     say(validate_stage(space))
+
+
+def _indented(text: str) -> str:
+    return "\n".join(f"    {line}" for line in text.splitlines())
 
 
 def describe_data(data: DataSet) -> str:
