@@ -15,7 +15,7 @@ from .body import Floats, Ints, Surface
 from .checks import Defects, SurfaceError, compacted, piece_numbers, put_in_order
 from .closest import distances, polydata
 from .metrics import cell_volumes, tetrahedron_quality
-from .smoothing import improved, outer_faces, used_points
+from .smoothing import Flags, improved, outer_faces, used_points
 from .tetwild import tetrahedra
 
 _log = logging.getLogger(__name__)
@@ -29,11 +29,11 @@ _TRIANGLE_EDGE = (
 )
 _EDGE_RATIO = 1.4  # fTetWild's wanted edge over the mean edge that it makes
 # Nodes are about this times volume / size^3 and this times area / size^2 (measured on organ surfaces).
-_NODES_IN_CUBE, _NODES_ON_SQUARE = 0.8, 1.6
+_NODES_IN_CUBE, _NODES_ON_SQUARE = 0.72, 1.44
 _LEFT_OUT = 0.01  # of the surface's size: a component whose median point lies farther from the solid is not in it
-_SEARCHES = 4
-_COUNT_TOLERANCE = 0.1
-_SLOPES = (-4.0, -1.0)
+_SEARCHES = 5
+_COUNT_TOLERANCE = 0.15
+_SLOPE = 2.2  # nodes fall with this power of the cell size: 3 inside, 2 on the surface, less where details bind
 _UNPINCHES = 20
 
 
@@ -101,8 +101,8 @@ def solidify(surface: Surface, cell_size: float | None = None, node_count: int |
     Args:
         surface: triangle surface, metres.
         cell_size: wanted mean edge length, metres. Give this or `node_count`.
-        node_count: wanted number of nodes; the edge length is searched until the number is met within a tenth, with
-            at most 4 meshes (the number reached is the length of the points returned, and is logged).
+        node_count: wanted number of nodes; the edge length is searched until the number is met within 15 %, with
+            at most 5 meshes (the number reached is the length of the points returned, and is logged).
 
     Raises:
         SurfaceError: no solid came, or only one with slivers.
@@ -168,23 +168,27 @@ def _size_estimate(surface: Surface, node_count: int) -> float:
 
 
 def _search_size(surface: Surface, node_count: int) -> tuple[Floats, Ints]:
-    size, slope = _size_estimate(surface, node_count), -2.5  # of log count over log size: -3 inside, -2 on the surface
-    tried: list[tuple[float, int]] = []
-    best: tuple[Floats, Ints] | None = None
+    size, found = _size_estimate(surface, node_count), dict[float, tuple[Floats, Ints]]()
     for _ in range(_SEARCHES):
-        found = _filled(surface, size)
-        count = len(found[0])
+        found[size] = _filled(surface, size)
+        count = len(found[size][0])
         _log.info("cells of %.3g mm give %d nodes, wanted %d", 1e3 * size, count, node_count)
-        if best is None or abs(count - node_count) < abs(len(best[0]) - node_count):
-            best = found
         if abs(count / node_count - 1) <= _COUNT_TOLERANCE:
             break
-        if tried:
-            slope = float(np.clip(np.log(count / tried[-1][1]) / np.log(size / tried[-1][0]), *_SLOPES))
-        tried.append((size, count))
-        size *= (node_count / count) ** (1 / slope)
-    assert best is not None
-    return best
+        surface = _without(surface, _left_out(surface, *found[size])[0])  # what is left out need not be meshed again
+        size = _next_size({tried: len(mesh[0]) for tried, mesh in found.items()}, node_count)
+    return min(found.values(), key=lambda mesh: abs(np.log(len(mesh[0]) / node_count)))
+
+
+def _next_size(counts: dict[float, int], wanted: int) -> float:
+    """The cell size to try next, from the numbers of nodes that others gave: a straight line through logarithms."""
+    small = max((size for size, count in counts.items() if count >= wanted), default=None)
+    large = min((size for size, count in counts.items() if count < wanted), default=None)
+    if small is not None and large is not None and small < large:
+        part = np.log(wanted / counts[large]) / np.log(counts[small] / counts[large])
+        return float(large * (small / large) ** part)
+    last = list(counts)[-1]
+    return float(last * (counts[last] / wanted) ** (1 / _SLOPE))
 
 
 def _filled(surface: Surface, cell_size: float) -> tuple[Floats, Ints]:
@@ -282,20 +286,13 @@ def _lesser(cells: Ints, chosen: Ints, volumes: Floats) -> Ints:
 
 
 def _mending(surface: Surface, defects: Defects, points: Floats, cells: Ints) -> Mending:
-    faces, outer = outer_faces(cells)
-    boundary = compacted(Surface(points, faces[outer]))
-    there = distances(surface, _samples(boundary))
-    back = distances(boundary, _samples(surface))
     pieces = piece_numbers(surface)
-    numbers = np.concatenate([pieces, pieces[surface.triangles[:, 0]]])
-    far = np.array([np.median(back[numbers == piece]) for piece in range(pieces.max() + 1)]) > _LEFT_OUT * _size(
-        surface
-    )
-    volumes = [volume for piece, volume in enumerate(_volumes(surface, pieces)) if far[piece]]
-    kept = back[~far[numbers]]
+    far, back = _left_out(surface, points, cells)
+    there = distances(surface, _samples(_boundary(points, cells)))
+    kept = back[~far[_sample_pieces(surface, pieces)]]
     return Mending(
         defects=defects,
-        dropped=tuple(sorted(volumes, reverse=True)),
+        dropped=tuple(np.sort(_volumes(surface, pieces)[far])[::-1].tolist()),
         volume_before=surface.volume,
         volume_after=float(cell_volumes(points, cells).sum()),
         distance=float(max(there.max(), kept.max())),
@@ -303,11 +300,34 @@ def _mending(surface: Surface, defects: Defects, points: Floats, cells: Ints) ->
     )
 
 
-def _volumes(surface: Surface, pieces: Ints) -> list[float]:
+def _left_out(surface: Surface, points: Floats, cells: Ints) -> tuple[Flags, Floats]:
+    """Which components of a surface the solid does not follow, and the distances of the surface's samples to it."""
+    away = distances(_boundary(points, cells), _samples(surface))
+    pieces = piece_numbers(surface)
+    order = np.argsort(_sample_pieces(surface, pieces), kind="stable")
+    groups = np.split(away[order], np.cumsum(np.bincount(_sample_pieces(surface, pieces)))[:-1])
+    return np.array([np.median(group) for group in groups]) > _LEFT_OUT * _size(surface), away
+
+
+def _without(surface: Surface, far: Flags) -> Surface:
+    pieces = piece_numbers(surface)
+    return compacted(Surface(surface.points, surface.triangles[~far[pieces[surface.triangles[:, 0]]]]))
+
+
+def _boundary(points: Floats, cells: Ints) -> Surface:
+    faces, outer = outer_faces(cells)
+    return compacted(Surface(points, faces[outer]))
+
+
+def _sample_pieces(surface: Surface, pieces: Ints) -> Ints:
+    return np.concatenate([pieces, pieces[surface.triangles[:, 0]]])
+
+
+def _volumes(surface: Surface, pieces: Ints) -> Floats:
     """Volume that each piece encloses, cubic metres."""
     corners = (surface.points - surface.points.mean(axis=0))[surface.triangles]
     six = np.einsum("ti,ti->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    return (np.bincount(pieces[surface.triangles[:, 0]], six) / 6).tolist()
+    return np.bincount(pieces[surface.triangles[:, 0]], six) / 6
 
 
 def _samples(surface: Surface) -> Floats:
