@@ -468,7 +468,7 @@ def _read_table(path: Path) -> Floats:
 def _is_cut(lines: list[str]) -> bool:
     """True where all last numbers but that of the last line end alike (digits after the point, exponent)."""
     ends = [re.sub(r"^[-+]?\d*", "", line.split()[-1]) for line in lines[-_LAST_LINES:]]
-    shapes = {re.sub(r"\d", "0", end) for end in ends[:-1]}
+    shapes = {re.sub(r"\d", "0", end).replace("-", "+") for end in ends[:-1]}
     return len(ends) > 2 and len(shapes) == 1 and len(ends[-1]) < len(ends[0])
 
 

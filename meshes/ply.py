@@ -141,14 +141,12 @@ def _equal_rows(body: bytes, at: int, element: _Element, order: str) -> NDArray[
     kind = np.dtype(fields)
     whole = (len(body) - at) // kind.itemsize if kind.itemsize else 0
     rows: NDArray[np.void] = np.frombuffer(body, kind, min(element.rows, whole), at)
-    alike = all(
-        (rows[f"length of {one.name}"] == rows.dtype[one.name].shape[0]).all()
-        for one in element.properties
-        if one.count and element.rows
-    )
-    if alike:
+    lists = [one.name for one in element.properties if one.count and element.rows]
+    if not lists:
         _check_rows(element, len(rows))
-    return rows if alike else None
+    whole_rows = len(rows) == element.rows
+    alike = all((rows[f"length of {name}"] == rows.dtype[name].shape[0]).all() for name in lists)
+    return rows if whole_rows and alike else None
 
 
 def _unequal_rows(body: bytes, at: int, element: _Element, order: str) -> tuple[int, dict[str, Column]]:
