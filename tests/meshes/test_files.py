@@ -367,7 +367,7 @@ def test_a_text_cloud_cut_in_the_middle_of_a_number_is_refused(tmp_path: Path, b
             read_cloud(tmp_path / "cut.txt")
         (tmp_path / "whole.txt").write_text(text[:-1])  # an editor that writes no last line end
         assert len(read_cloud(tmp_path / "whole.txt")) == len(ball.points)
-    (tmp_path / "free.txt").write_text("1 2 3.25\n4 5 6.5\n7 8 9.125\n1 2 3")
+    (tmp_path / "free.txt").write_text("0 1 .25\n0 1 .5\n0 1 .125\n0 1 1")
     assert len(read_cloud(tmp_path / "free.txt")) == 4
 
 
