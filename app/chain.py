@@ -78,6 +78,7 @@ def make_twin(space: Workspace, path: Path, say: Say, again: bool = False) -> No
     body = _mesh(space, say)
     say(f"    {len(body.points)} nodes, {len(body.cells)} cells, {len(body.fixed)} fixed, {1e3 * body.volume:.2f} l")
     check_loads(body, load_plan(space.config))
+    say(_indented((space.folder / "mesh_quality.txt").read_text()))
     say("2/4 generate: eigenmodes, modal loads, equilibria")
     _generate(space, body, path, say, again)
     say("3/4 train: the surrogate")
@@ -97,6 +98,10 @@ def _mesh(space: Workspace, say: Say) -> Body:
     if changed:
         say(f"    made again, what it is made of has changed: {'; '.join(changed)}")
     return mesh_stage(space)
+
+
+def _indented(text: str) -> str:
+    return "\n".join(f"    {line}" for line in text.splitlines())
 
 
 def _generate(space: Workspace, body: Body, path: Path, say: Say, again: bool) -> None:

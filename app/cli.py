@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -13,6 +14,8 @@ import click
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from softtwin.meshes.attachment import File, parse_file, parse_regions
+from softtwin.meshes.files import stated_frame
 from softtwin.reference.ranks import FailedElsewhere
 
 from .config import LAWS, Config, ConfigError, parse_config, to_toml
@@ -154,21 +157,21 @@ def report(configuration: Path) -> None:
 
 @softtwin.command()
 @click.argument("surface_or_mesh", type=_PATH)
+@click.option("--fixed", multiple=True, metavar="WHERE", help="What holds the organ (may be repeated).")
 @click.option(
-    "--fixed", type=_PATH, help="What holds the organ: points or triangles near it, or node numbers (.npy, .txt)."
-)
-@click.option(
-    "--fixed-distance", type=float, default=0.0, help="How near to --fixed a node is fixed, metres; 0: one cell."
+    "--fixed-distance", type=float, default=0.0, help="How near to a file of --fixed a node is fixed, m; 0: one cell."
 )
 @click.option("--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the files.")
 @click.option(
-    "--observed", type=_PATH, help="The side a camera sees: a surface file, or triangles of node numbers (.npy)."
+    "--frame",
+    type=click.Choice(["lps", "ras"], case_sensitive=False),
+    help="Frame of the files that say none. One in another frame than the organ's is turned.",
 )
-@click.option("--zone", "zones", multiple=True, metavar="NAME=FILE", help="Where tools may touch (may be repeated).")
+@click.option("--observed", multiple=True, metavar="WHERE", help="The side that a camera sees.")
+@click.option("--zone", "zones", multiple=True, metavar="NAME=WHERE", help="Where tools may touch (may be repeated).")
 @click.option("--inner", multiple=True, metavar="NAME=FILE", help="A vessel or tumour surface to carry along.")
 @click.option("--nodes", type=int, default=2000, show_default=True, help="Nodes wanted where a surface is made solid.")
 @click.option("--cell-size", type=float, default=0.0, help="Edge length instead, metres.")
-@click.option("--repair", is_flag=True, help="Mend an open or self-intersecting surface first.")
 @click.option("--law", type=click.Choice(LAWS), default="neo-hookean", show_default=True)
 @click.option("--young-modulus", type=float, default=5000.0, show_default=True, help="Pascals.")
 @click.option("--poisson-ratio", type=float, default=0.45, show_default=True)
@@ -190,21 +193,35 @@ def report(configuration: Path) -> None:
 def build(
     surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, again: bool, **given: Any
 ) -> None:
-    """Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH): mesh, equilibria, surrogate, held-out errors.
+    r"""Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH): mesh, equilibria, surrogate, held-out errors.
+
+    A surface may have holes, crumbs, overlaps, any winding: it is made solid, and what was done to it is said.
 
     Writes OUTPUT/organ.toml with all settings; run again after an interruption, it goes on where it stopped. With
     other options or changed files it makes again what depends on them; only equilibria that were solved are never
     thrown away unasked.
+
+    \b
+    WHERE is a file, or words. Lengths without a unit are in --unit.
+      veins.ply                       near its points; (n,) node numbers in .npy or .txt; for
+                                      --observed a surface, or (t, 3) node numbers in .npy
+      near:hepatic_vein:5mm           within 5 mm of the --inner surface of that name
+      ball:10,-20,35mm:15mm           centre and radius
+      box:0,0,0:40,30,20mm            two corners
+      halfspace:0,0,12mm:0,0,-1       a point, and the side that the normal points to
+      seen-from:0,-400,100mm          what a camera at that place sees
+    A FILE in another unit or frame has it behind its name: veins.ply:mm, tumour.stl:cm:ras.
     """
     from .chain import build_twin
 
     body = {
-        "source": str(surface_or_mesh.resolve()),
-        "fixed": str(given["fixed"].resolve()) if given["fixed"] else "",
-        "observed": str(given["observed"].resolve()) if given["observed"] else "",
-        "zones": _named_files("--zone", zones),
-        "inner": _named_files("--inner", inner),
-        **{name: given[name] for name in ("unit", "nodes", "cell_size", "repair", "fixed_distance")},
+        "source": _with_frame(_resolved(str(surface_or_mesh))),
+        "fixed": " + ".join(map(_resolved, given["fixed"])),
+        "observed": " + ".join(map(_resolved, given["observed"])),
+        "zones": _named("--zone", zones),
+        "inner": _named("--inner", inner),
+        "frame": given["frame"] or "",
+        **{name: given[name] for name in ("unit", "nodes", "cell_size", "fixed_distance")},
     }
     entries = {
         "folder": ".",
@@ -223,14 +240,27 @@ def build(
     build_twin(parse_config(entries, "command line"), output, click.echo, again)
 
 
-def _named_files(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:
+def _named(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:
     named = {}
     for pair in pairs:
-        name, equals, file = pair.partition("=")
-        if not (name and equals and file):
-            raise ConfigError(f"{flag}: expected NAME=FILE, got {pair!r}.")
-        named[name] = str(Path(file).resolve())
+        name, equals, where = pair.partition("=")
+        if not (name and equals and where):
+            raise ConfigError(f"{flag}: expected NAME={'FILE' if flag == '--inner' else 'WHERE'}, got {pair!r}.")
+        named[name] = _resolved(where)
     return named
+
+
+def _with_frame(source: str) -> str:
+    """The source with the frame that it states about itself, so that the configuration holds it."""
+    file = parse_file(source)
+    return str(file if file.frame else replace(file, frame=stated_frame(file.path)))
+
+
+def _resolved(where: str) -> str:
+    """The words as they are; a file with its whole path."""
+    regions = parse_regions(where)
+    resolved = [str(replace(r, path=r.path.resolve())) if isinstance(r, File) else "" for r in regions]
+    return " + ".join(file or words.strip() for file, words in zip(resolved, where.split(" + "), strict=True))
 
 
 @softtwin.command()

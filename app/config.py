@@ -25,31 +25,44 @@ class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+# What says where something is: `meshes/attachment.py` reads it.
+_WHERE = (
+    "near:STRUCTURE:5mm, ball:X,Y,Z:R, box:X,Y,Z:X,Y,Z, halfspace:X,Y,Z:NX,NY,NZ or seen-from:X,Y,Z "
+    "(a unit behind a number, else unit), or several with ' + ' between"
+)
+
+
 class BodySection(_Section):
-    """Where the body comes from."""
+    """Where the body comes from. A file with another unit or frame has it behind its name (veins.ply:mm:ras)."""
 
     source: str = Field(
         "liver-phantom",
         description="a surface or mesh file (STL PLY OBJ VTK VTU VTP MSH), or a shape: liver-phantom, propeller, beam",
     )
     unit: Literal["m", "cm", "mm"] = Field("m", description="unit of length in the files")
+    frame: Literal["", "lps", "ras"] = Field(
+        "",
+        description="frame of the files that say none, lps or ras; a file in another frame than the source is turned",
+    )
     cell_size: float = Field(0.0, ge=0.0, description="edge length of the tetrahedra in metres; 0: from nodes")
     nodes: Count = Field(2000, description="number of nodes wanted where a surface is made solid and cell_size is 0")
-    repair: bool = Field(False, description="mend an open or self-intersecting surface first")
     fixed: str = Field(
         "",
-        description="what holds the organ: points or triangles near it, or .npy/.txt of node numbers",
+        description=f"what holds the organ: points or triangles near it, .npy/.txt of node numbers, or {_WHERE}",
     )
-    fixed_distance: float = Field(0.0, ge=0.0, description="how near, in metres; 0: one cell")
+    fixed_distance: float = Field(
+        0.0, ge=0.0, description="how near to a file of fixed a node is fixed, in metres; 0: one cell"
+    )
     observed: str = Field(
         "",
-        description="what a camera sees: a surface file or (t, 3) node numbers in .npy; empty: the whole boundary",
+        description="what a camera sees: a surface file, (t, 3) node numbers in .npy, or words as for fixed; "
+        "empty: the whole boundary",
     )
     zones: dict[str, str] = Field(
-        default_factory=dict, description="named zones that tools may touch: files as for fixed"
+        default_factory=dict, description="named zones that tools may touch: files or words as for fixed"
     )
     inner: dict[str, str] = Field(
-        default_factory=dict, description="named inner surfaces (vessels, tumours): surface files in the same unit"
+        default_factory=dict, description="named inner surfaces (vessels, tumours): surface files"
     )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from softtwin.meshes.attachment import parse_file
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_body
 from softtwin.reference.dataset import DataSet, DataSetError, differences, existing
@@ -191,8 +192,11 @@ def _flat(prefix: str, entries: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _content(value: Any, root: Path) -> Any:
-    if isinstance(value, str) and value and (root / value).is_file():
-        return f"sha256:{_sha256(root / value)}"
+    if isinstance(value, str) and value:
+        named = parse_file(value)  # its unit and frame may stand behind it, or words may stand there instead
+        if (root / named.path).is_file():
+            behind = "".join(f":{word}" for word in (named.unit, named.frame) if word)
+            return f"sha256:{_sha256(root / named.path)}{behind}"
     return [_content(item, root) for item in value] if isinstance(value, list | tuple) else value
 
 

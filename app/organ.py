@@ -2,74 +2,232 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from softtwin.meshes.body import Body, BodyError
-from softtwin.meshes.files import FileError, read_cloud, read_mesh, read_surface
-from softtwin.meshes.metrics import edge_lengths
+from softtwin.meshes.attachment import (
+    File,
+    Region,
+    boundary_nodes,
+    boundary_triangles,
+    check_structure,
+    median_edge,
+    parse_file,
+    parse_regions,
+)
+from softtwin.meshes.body import Body, BodyError, Surface
+from softtwin.meshes.embedding import embed
+from softtwin.meshes.files import (
+    LARGEST,
+    SMALLEST,
+    FileError,
+    Frame,
+    Unit,
+    read_cloud,
+    read_mesh,
+    read_surface,
+    stated_frame,
+)
 from softtwin.meshes.shapes import beam, liver_phantom, propeller
-from softtwin.meshes.solidify import repair, solidify
+from softtwin.meshes.solidify import solidify
 
 from .config import BodySection, ConfigError
 
 Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
 SHAPES: dict[str, Callable[..., Body]] = {"liver-phantom": liver_phantom, "propeller": propeller, "beam": beam}
+_MOSTLY = 0.5  # of an inner surface's vertices: more outside the body, and it belongs to another one
+_TOUCHING = 1e-3  # of the body's size: nearer to it a point outside is round-off of the mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Organ:
+    """A body, and what was done and found on the way to it.
+
+    Args:
+        body: the body.
+        notes: one line each; those that start with `warning:` may be a mistake of the input.
+    """
+
+    body: Body
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """How the files of one body are read: where they lie, their unit, and the frame of the body (None: not known)."""
+
+    root: Path
+    unit: Unit
+    given: Frame | None
+    body: Frame | None
+
+    def options(self, file: File) -> tuple[Path, Unit, Frame]:
+        """Path, unit and axes to read a file with; `ras` turns it, where its frame is another than the body's."""
+        path = self.root / file.path
+        frame = file.frame or stated_frame(path) or self.given
+        turned = self.body is not None and frame is not None and frame != self.body
+        return path, file.unit or self.unit, "ras" if turned else "lps"
 
 
 def make_body(section: BodySection, root: Path) -> Body:
-    """The body that a configuration describes.
+    """The body that a configuration describes; see `make_organ`."""
+    return make_organ(section, root).body
+
+
+def make_organ(section: BodySection, root: Path) -> Organ:
+    """The body that a configuration describes, and what was done to its surface.
+
+    Args:
+        section: the configuration's [body].
+        root: folder that relative paths start from.
+
+    Raises:
+        RegionError, FileError, SurfaceError, BodyError, ConfigError: what is wrong with the input. What can be seen
+            before a surface is made solid is said before.
+    """
+    regions = _checked_regions(section, root)
+    notes: list[str] = []
+    if section.source in SHAPES:
+        reader = _Reader(root, section.unit, section.frame or None, section.frame or None)
+        body = SHAPES[section.source](**_shape_options(section))
+    else:
+        source = parse_file(section.source)
+        reader = _Reader(root, section.unit, section.frame or None, body_frame(section, root))
+        points, cells, notes = _solid(section, reader, source)
+        body = Body(points, cells, {})
+        notes += [f"frame: {reader.body.upper()}"] if reader.body else []
+    for name, text in section.inner.items():
+        surface = read_surface(*reader.options(parse_file(text)))
+        notes += _outside(body, name, surface)
+        body = body.with_inner(**{name: surface})
+    if regions["fixed"]:
+        body = body.with_sets(fixed=_attached(body, _nodes(body, "body.fixed", regions["fixed"], section, reader)))
+    zones = {
+        zone: _nodes(body, f"body.zones.{zone}", regions[f"zones.{zone}"], section, reader) for zone in section.zones
+    }
+    body = body.with_sets(**zones)
+    if regions["observed"]:
+        observed, said = _observed(body, regions["observed"], reader)
+        body, notes = replace(body, surfaces={**body.surfaces, "observed": observed}), [*notes, *said]
+    return Organ(body, tuple(notes))
+
+
+def body_frame(section: BodySection, root: Path) -> Frame | None:
+    """The frame of a body: what its source is said to have, or says itself, or `frame`; None where nobody says.
 
     Args:
         section: the configuration's [body].
         root: folder that relative paths start from.
     """
     if section.source in SHAPES:
-        body = SHAPES[section.source](**({"cell_size": section.cell_size} if _takes_size(section) else {}))
-        return _with_zones(body, section, root)
-    points, cells = _solid(section, root)
-    if not section.fixed:
+        return section.frame or None
+    source = parse_file(section.source)
+    stated = stated_frame(root / source.path) if (root / source.path).is_file() else None
+    return source.frame or stated or section.frame or None
+
+
+def _checked_regions(section: BodySection, root: Path) -> dict[str, tuple[Region, ...]]:
+    """The regions of attachment, zones and observed side, refused where they cannot be before a mesh is made."""
+    if section.source not in SHAPES and not section.fixed:
         raise BodyError(
             "body.fixed: expected what holds the organ, got nothing; without it the organ has no equilibrium. Give "
-            "--fixed FILE (points or triangles near the attachment, or .npy/.txt with node numbers)."
+            "--fixed FILE (points or triangles near the attachment, or .npy/.txt with node numbers), or say where it "
+            "is: near:STRUCTURE:5mm, ball:X,Y,Z:RADIUS, box:X,Y,Z:X,Y,Z, halfspace:X,Y,Z:NX,NY,NZ."
         )
-    bare = Body(points, cells, {"fixed": np.arange(len(points) - 1)})
-    fixed = _nodes_from(bare, "body.fixed", root / section.fixed, section)
-    body = Body(points, cells, {"fixed": _attached(bare, fixed)})
-    return _with_zones(body, section, root)
+    texts = {"fixed": section.fixed, "observed": section.observed}
+    texts |= {f"zones.{name}": text for name, text in section.zones.items()}
+    regions = {name: parse_regions(text, section.unit) if text else () for name, text in texts.items()}
+    structures = (*section.inner, *_OWN_STRUCTURES.get(section.source, ()))
+    for region in (region for group in regions.values() for region in group):
+        check_structure(region, structures)
+    files = [region for group in regions.values() for region in group if isinstance(region, File)]
+    for file in [*files, *(parse_file(text) for text in section.inner.values())]:
+        if not (root / file.path).is_file():
+            raise FileError(f"{root / file.path}: no such file.")
+    return regions
 
 
-def _takes_size(section: BodySection) -> bool:
-    return section.cell_size > 0.0 and section.source != "beam"
+_OWN_STRUCTURES = {"liver-phantom": ("vessel_portal", "vessel_hepatic", "tumour")}
 
 
-def _solid(section: BodySection, root: Path) -> tuple[NDArray[np.float64], Ints]:
-    found = read_mesh(root / section.source, section.unit)
-    if isinstance(found, tuple):
-        return found
-    surface = repair(found) if section.repair else found
+def _shape_options(section: BodySection) -> dict[str, float]:
+    return {"cell_size": section.cell_size} if section.cell_size > 0.0 and section.source != "beam" else {}
+
+
+def _solid(section: BodySection, reader: _Reader, source: File) -> tuple[Floats, Ints, list[str]]:
+    found = read_mesh(*reader.options(source))
+    points = found.points if isinstance(found, Surface) else found[0]
+    _check_size(reader.root / source.path, float(np.ptp(points, axis=0).max()), source.unit or section.unit)
+    if not isinstance(found, Surface):
+        return *found, []
     if section.cell_size > 0.0:
-        return solidify(surface, cell_size=section.cell_size)
-    return solidify(surface, node_count=section.nodes)
+        solid = solidify(found, cell_size=section.cell_size)
+    else:
+        solid = solidify(found, node_count=section.nodes)
+    return solid.points, solid.cells, str(solid.mending).splitlines()
 
 
-def _attached(bare: Body, nodes: Ints) -> Ints:
+def _check_size(path: Path, size: float, unit: Unit) -> None:
+    if not SMALLEST <= size <= LARGEST:
+        raise FileError(
+            f"{path}: expected an organ of {1e3 * SMALLEST:g} mm to {LARGEST:g} m, got {size:.3g} m across when read "
+            f"in {unit}; if it is in another unit, say so with --unit (m, cm or mm)."
+        )
+
+
+def _outside(body: Body, name: str, surface: Surface) -> list[str]:
+    """What to say of an inner surface that does not lie inside.
+
+    Raises:
+        BodyError: most of it lies outside.
+    """
+    outside = embed(body, surface.points).outside
+    share = float((outside > _TOUCHING * body.size).mean())
+    if share > _MOSTLY:
+        raise BodyError(
+            f"body.inner.{name}: expected a surface inside the organ, got {100 * share:.0f} % of its vertices outside, "
+            f"up to {1e3 * outside.max():.1f} mm; has its file another unit (FILE:mm) or frame (FILE:ras)?"
+        )
+    if share > 0:
+        return [
+            f"warning: {name}: {100 * share:.1f} % of its vertices lie outside the organ, up to "
+            f"{1e3 * outside.max():.1f} mm; they move with the nearest point of the boundary"
+        ]
+    return []
+
+
+def _attached(body: Body, nodes: Ints) -> Ints:
     """The given nodes that belong to a boundary triangle given whole: an attachment is a surface, not a lone node."""
-    whole = bare.boundary[np.isin(bare.boundary, nodes).all(axis=1)]
+    whole = body.boundary[np.isin(body.boundary, nodes).all(axis=1)]
     if len(whole) == 0:
         raise BodyError(
             f"body.fixed: expected fixed nodes that cover part of the surface, got {len(nodes)} nodes that span no "
-            "whole boundary triangle; enlarge fixed_distance or give more of the attachment."
+            "whole boundary triangle; enlarge the distance (--fixed-distance) or give more of the attachment."
         )
     return np.unique(whole)
 
 
-def _nodes_from(body: Body, name: str, path: Path, section: BodySection) -> Ints:
+def _nodes(body: Body, name: str, regions: Iterable[Region], section: BodySection, reader: _Reader) -> Ints:
+    """Nodes of a union of regions, sorted."""
+    near = section.fixed_distance if name == "body.fixed" else 0.0
+    parts = [
+        _nodes_of_file(body, name, region, near or median_edge(body), reader)
+        if isinstance(region, File)
+        else boundary_nodes(region, body)
+        for region in regions
+    ]
+    return np.unique(np.concatenate(parts))
+
+
+def _nodes_of_file(body: Body, name: str, file: File, near: float, reader: _Reader) -> Ints:
     """Node numbers from a file of numbers, or the boundary nodes near the points of a file."""
+    path, unit, axes = reader.options(file)
     numbers = _read_numbers(path)
     if numbers is not None:
         if numbers.size and (numbers.min() < 0 or numbers.max() >= len(body.points)):
@@ -78,13 +236,13 @@ def _nodes_from(body: Body, name: str, path: Path, section: BodySection) -> Ints
                 f"got {numbers.min()}..{numbers.max()} in {path}."
             )
         return np.unique(numbers)
-    near = section.fixed_distance or float(np.median(edge_lengths(body.points, body.cells)))
-    distances, _ = cKDTree(read_cloud(path, section.unit)).query(body.points[body.boundary_nodes])
+    distances, _ = cKDTree(read_cloud(path, unit, axes)).query(body.points[body.boundary_nodes])
     nodes = body.boundary_nodes[distances <= near]
     if len(nodes) == 0:
         raise BodyError(
             f"{name}: no boundary node lies within {1e3 * near:.1f} mm of the points in {path} "
-            f"(the nearest is {1e3 * distances.min():.1f} mm away). Same unit and axes? Else raise fixed_distance."
+            f"(the nearest is {1e3 * distances.min():.1f} mm away). Same unit and frame? Else "
+            f"{'raise --fixed-distance' if name == 'body.fixed' else 'give points nearer to the surface'}."
         )
     return nodes
 
@@ -104,29 +262,45 @@ def _read_numbers(path: Path) -> Ints | None:
     return values.astype(np.int64)
 
 
-def _with_zones(body: Body, section: BodySection, root: Path) -> Body:
-    zones = {
-        name: _nodes_from(body, f"body.zones.{name}", root / file, section) for name, file in section.zones.items()
-    }
-    body = body.with_sets(**zones)
-    inner = {name: read_surface(root / file, section.unit) for name, file in section.inner.items()}
-    body = body.with_inner(**inner)
-    if not section.observed:
-        return body
-    return Body(
-        body.points,
-        body.cells,
-        body.node_sets,
-        {**body.surfaces, "observed": _observed(body, root / section.observed, section)},
-        body.inner,
-    )
+def _observed(body: Body, regions: Iterable[Region], reader: _Reader) -> tuple[Ints, list[str]]:
+    """Boundary triangles of a union of regions, each once and wound outward, and what to say of it."""
+    parts = [
+        _triangles_of_file(body, region, reader) if isinstance(region, File) else boundary_triangles(region, body)
+        for region in regions
+    ]
+    given = np.concatenate(parts)
+    known = {tuple(sorted(triangle)): i for i, triangle in enumerate(body.boundary.tolist())}
+    numbers = [known.get(tuple(sorted(triangle))) for triangle in given.tolist()]
+    strange = sum(number is None for number in numbers)
+    if strange:
+        raise BodyError(
+            f"body.observed: expected triangles of the body's boundary, got {strange} of {len(given)} that are not."
+        )
+    chosen = body.boundary[np.unique(np.array(numbers))]
+    shifted = np.stack([np.roll(given, turn, axis=1) for turn in range(3)])
+    outward = (shifted == body.boundary[np.array(numbers)]).all(axis=2).any(axis=0)
+    turned = int((~outward).sum())
+    return chosen, [f"observed: {turned} of {len(given)} triangles wound inward and were turned"] if turned else []
 
 
-def _observed(body: Body, path: Path, section: BodySection) -> Ints:
+def _triangles_of_file(body: Body, file: File, reader: _Reader) -> Ints:
+    path, unit, axes = reader.options(file)
     if path.suffix == ".npy":
-        return np.load(path)
-    near = section.fixed_distance or float(np.median(edge_lengths(body.points, body.cells)))
-    distances, _ = cKDTree(read_surface(path, section.unit).points).query(body.points[body.boundary].mean(axis=1))
+        triangles = np.load(path)
+        if triangles.ndim == 2 and triangles.shape[1] == 3 and np.issubdtype(triangles.dtype, np.integer):
+            if triangles.size and (triangles.min() < 0 or triangles.max() >= len(body.points)):
+                raise BodyError(
+                    f"body.observed: expected node numbers in 0..{len(body.points) - 1}, "
+                    f"got {triangles.min()}..{triangles.max()} in {path}."
+                )
+            return triangles.astype(np.int64)
+        raise BodyError(f"body.observed: expected node numbers of shape (t, 3), got {triangles.dtype} of shape "
+                        f"{triangles.shape} in {path}.")  # fmt: skip
+    near = median_edge(body)
+    distances, _ = cKDTree(read_surface(path, unit, axes).points).query(body.points[body.boundary].mean(axis=1))
     if not (distances <= near).any():
-        raise ConfigError(f"body.observed: no boundary triangle lies within {1e3 * near:.1f} mm of {path}.")
+        raise ConfigError(
+            f"body.observed: no boundary triangle lies within {1e3 * near:.1f} mm of {path} "
+            f"(the nearest is {1e3 * distances.min():.1f} mm away). Same unit and frame?"
+        )
     return body.boundary[distances <= near]

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
-from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
 from vtkmodules.vtkCommonCore import vtkPoints
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData, vtkStaticCellLocator
 
-from .body import Body, Floats, Ints, Surface
+from .body import Body, Floats, Surface
+from .closest import cell_locator
 
 _LIMIT_OF_SIZE = 0.5  # a cloud farther from the body than this part of its size needs a rigid start
 _UNIT_RATIO = 50.0  # a cloud this many times larger than the body is in another unit
@@ -98,41 +97,42 @@ def visible_triangles(surface: Surface, direction: ArrayLike) -> NDArray[np.bool
     towards = np.asarray(direction, dtype=np.float64)
     if towards.shape != (3,) or not np.isfinite(towards).all() or not np.linalg.norm(towards) > 0:
         raise ValueError(f"direction: expected three finite numbers that are not all zero, got {direction!r}.")
-    towards = towards / np.linalg.norm(towards)
+    far = 2 * float(np.linalg.norm(np.ptp(surface.points, axis=0)))
+    return _facing(surface, np.tile(far * towards / np.linalg.norm(towards), (len(surface.triangles), 1)))
+
+
+def triangles_seen_from(surface: Surface, position: ArrayLike) -> NDArray[np.bool_]:
+    """True for each triangle that faces a camera at a place and is not hidden behind others, (t,).
+
+    Args:
+        surface: closed triangle surface wound outward, metres.
+        position: of the camera, (3,), metres.
+
+    Raises:
+        ValueError: the position is not three finite numbers.
+    """
+    camera = np.asarray(position, dtype=np.float64)
+    if camera.shape != (3,) or not np.isfinite(camera).all():
+        raise ValueError(f"position: expected three finite numbers, got {position!r}.")
+    return _facing(surface, camera - surface.points[surface.triangles].mean(axis=1))
+
+
+def _facing(surface: Surface, towards: Floats) -> NDArray[np.bool_]:
+    """Triangles that face their camera and have nothing between; `towards` leads from centroids to it, (t, 3)."""
     a, b, c = (surface.points[surface.triangles[:, i]] for i in range(3))
-    seen = np.cross(b - a, c - a) @ towards > 0
-    seen[seen] = ~_hidden(surface, ((a + b + c) / 3)[seen], towards)
+    seen = np.einsum("ti,ti->t", np.cross(b - a, c - a), towards) > 0
+    seen[seen] = ~_hidden(surface, ((a + b + c) / 3)[seen], towards[seen])
     return seen
 
 
 def _hidden(surface: Surface, points: Floats, towards: Floats) -> NDArray[np.bool_]:
     size = float(np.linalg.norm(np.ptp(surface.points, axis=0)))
     locator = cell_locator(surface)
-    starts, ends = points + 1e-6 * size * towards, points + 2 * size * towards
+    starts = points + 1e-6 * size * towards / np.linalg.norm(towards, axis=1, keepdims=True)
     hits, hit = vtkPoints(), np.zeros(len(points), dtype=bool)
-    for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
+    for i, (start, end) in enumerate(zip(starts, points + towards, strict=True)):
         hit[i] = locator.IntersectWithLine(start, end, hits, None)
     return hit
-
-
-def cell_locator(surface: Surface) -> vtkStaticCellLocator:
-    """A VTK locator of the surface's triangles, for closest points and intersections.
-
-    Args:
-        surface: triangle surface, metres.
-    """
-    mesh, points, polygons = vtkPolyData(), vtkPoints(), vtkCellArray()
-    points.SetData(numpy_to_vtk(surface.points, deep=True))
-    offsets: Ints = np.arange(0, surface.triangles.size + 1, 3)
-    polygons.SetData(
-        numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(surface.triangles.ravel(), deep=True)
-    )
-    mesh.SetPoints(points)
-    mesh.SetPolys(polygons)
-    locator = vtkStaticCellLocator()
-    locator.SetDataSet(mesh)
-    locator.BuildLocator()
-    return locator
 
 
 def check_cloud(cloud: ArrayLike, body: Body, limit: float | None = None) -> Floats:

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
-from vtkmodules.vtkCommonCore import mutable
 
 from .body import Body, Floats, Ints, Surface
-from .clouds import cell_locator
+from .closest import closest_points
 from .elements import split_facets
 
 # Corners of the reference cube in VTK order.
@@ -152,15 +150,7 @@ def _depths(body: Body, cells: Ints, points: Floats) -> Floats:
 
 def _nearest(body: Body, points: Floats) -> tuple[Ints, Floats, Floats]:
     """Cells at the nearest points of the boundary, these points and their distances."""
-    locator = cell_locator(body.boundary_surface)
-    nearest, triangles = np.empty_like(points), np.empty(len(points), dtype=np.int64)
-    closest = [0.0, 0.0, 0.0]
-    cell: Any = mutable(0)  # VTK writes its answers into these
-    part: Any = mutable(0)
-    square: Any = mutable(0.0)
-    for i, point in enumerate(points):
-        locator.FindClosestPoint(point.tolist(), closest, cell, part, square)
-        nearest[i], triangles[i] = closest, int(cell)
+    nearest, triangles = closest_points(body.boundary_surface, points)
     distances = np.linalg.norm(points - nearest, axis=1)
     return _owners(body)[triangles], nearest, distances
 

@@ -6,11 +6,12 @@ import contextlib
 import io
 import logging
 import os
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 from urllib.parse import quote, unquote
 
 import meshio
@@ -25,17 +26,23 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridRead
 
 from .body import Body, Floats, Ints, Surface, corner_jacobians
 from .elements import KINDS
+from .ply import read_ply
 
 Unit = Literal["m", "cm", "mm"]
-Axes = Literal["lps", "ras"]
+Frame = Literal["lps", "ras"]
+UNITS: tuple[str, ...] = get_args(Unit)
+FRAMES: tuple[str, ...] = get_args(Frame)
 
 _log = logging.getLogger(__name__)
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-_LARGEST, _SMALLEST = 2.0, 5e-3  # metres: an organ outside these was read in the wrong unit
-_MESHIO = (".stl", ".ply", ".obj", ".msh")
+LARGEST, SMALLEST = 2.0, 5e-3  # metres: an organ outside these was read in the wrong unit
+_MESHIO = (".stl", ".obj", ".msh")
 _VTK: Mapping[str, Any] = {".vtk": vtkDataSetReader, ".vtu": vtkXMLUnstructuredGridReader, ".vtp": vtkXMLPolyDataReader}
+_FIRST_MSH = {1: "line", 2: "triangle", 3: "quad", 4: "tetra", 5: "hexahedron", 15: "vertex"}  # gmsh's element types
 _TEXT = (".txt", ".csv", ".xyz")
 _VTK_NODES = {kind.vtk: (kind.name, kind.nodes) for kind in KINDS.values()}
+_LAST_LINES = 100  # of a text cloud, to see how its numbers end
+_HEAD = 2048  # bytes in which a file says what it is
 _MARK = "softtwin body"
 _PLAIN = " :()[]/,=+@"
 _PREFIXES = ("node_set:", "surface:", "inner_points:", "inner_triangles:")
@@ -67,7 +74,31 @@ class _Mesh:
         return f"{len(self.points)} points" + (f" and cells: {', '.join(counts)}" if counts else " and no cells")
 
 
-def read_mesh(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Surface | tuple[Floats, Ints]:
+def in_metres(lengths: ArrayLike, unit: Unit) -> Floats:
+    """Lengths in metres.
+
+    Args:
+        lengths: numbers of any shape.
+        unit: theirs.
+    """
+    # Dividing by a whole number rounds once; multiplying by 0.001 would round twice.
+    return np.asarray(lengths, dtype=np.float64) / round(1 / _METRES[unit])
+
+
+def stated_frame(path: str | Path) -> Frame | None:
+    """The frame that a file states about itself, as 3D Slicer writes it (`SPACE=RAS` in its comment); None for none.
+
+    Args:
+        path: any file.
+
+    Raises:
+        FileError: missing or empty file.
+    """
+    found = re.search(rb"SPACE=(LPS|RAS)\b", _existing(path).read_bytes()[:_HEAD])
+    return found.group(1).decode().lower() if found else None  # type: ignore[return-value]
+
+
+def read_mesh(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Surface | tuple[Floats, Ints]:
     """What a mesh file holds: points and cells where it has tetrahedra or hexahedra, else a surface.
 
     Args:
@@ -84,8 +115,8 @@ def read_mesh(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Surface
     return _surface(Path(path), mesh, unit, axes)
 
 
-def read_surface(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Surface:
-    """The triangles of a file as a surface in metres; quadrilaterals are split, an STL's double vertices merged.
+def read_surface(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Surface:
+    """The triangles of a file as a surface in metres; quadrilaterals are split, vertices at one place merged.
 
     Args:
         path: STL, PLY, OBJ, VTK, VTU, VTP or MSH file.
@@ -98,7 +129,7 @@ def read_surface(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Surf
     return _surface(Path(path), _read(path), unit, axes)
 
 
-def read_volume(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> tuple[Floats, Ints]:
+def read_volume(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> tuple[Floats, Ints]:
     """Points (n, 3) in metres and cells (m, 4) or (m, 8) of a volume mesh, the file's node numbers kept.
 
     Args:
@@ -112,24 +143,32 @@ def read_volume(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> tuple
     return _volume(Path(path), _read(path), unit, axes)
 
 
-def read_cloud(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Floats:
+def read_cloud(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Floats:
     """The points of a file, (p, 3), metres.
 
     Args:
-        path: text with three columns (TXT, CSV, XYZ), NPY, or any mesh file whose points are taken.
+        path: text with three columns (TXT, CSV, XYZ), NPY, PCD (points without a measurement, NaN, are left out), or
+            any mesh file whose points are taken.
         unit: the file's unit of length.
         axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign).
 
     Raises:
-        FileError: missing, empty, damaged or unknown file, or not three columns of numbers.
+        FileError: missing, empty, damaged or unknown file, or not three columns of finite numbers.
     """
     path = _existing(path)
-    points = _read_table(path) if path.suffix.lower() in (*_TEXT, ".npy") else _read(path).points
+    suffix = path.suffix.lower()
+    points = (
+        _read_table(path) if suffix in (*_TEXT, ".npy") else _read_pcd(path) if suffix == ".pcd" else _read(path).points
+    )
     if points.ndim != 2 or points.shape[1] != 3:
         raise FileError(f"{path}: expected a cloud of shape (p, 3), got {points.shape}.")
     if len(points) == 0:
         raise FileError(f"{path}: expected a cloud with points, got none.")
-    return _in_metres(path, points, unit, axes, smallest=0.0)
+    if not np.isfinite(points).all():
+        bad = int((~np.isfinite(points).all(axis=1)).sum())
+        raise FileError(f"{path}: expected finite coordinates, got NaN or infinity in {bad} of {len(points)} points; "
+                        "remove them.")  # fmt: skip
+    return _placed(path, points, unit, axes, smallest=0.0)
 
 
 def write_body(path: str | Path, body: Body, fields: Mapping[str, ArrayLike] | None = None) -> None:
@@ -252,10 +291,16 @@ def _read(path: str | Path) -> _Mesh:
     suffix = path.suffix.lower()
     if suffix in _VTK:
         mesh = _from_vtk(path)
+    elif suffix == ".msh" and path.read_bytes()[:_HEAD].lstrip().startswith(b"$NOD"):
+        mesh = _from_first_msh(path)
+    elif suffix == ".ply":
+        mesh = _from_ply(path)
     elif suffix in _MESHIO:
+        if suffix == ".stl":
+            _check_stl(path)
         mesh = _from_meshio(path)
     else:
-        known = ", ".join((*_MESHIO, *_VTK))
+        known = ", ".join((*_MESHIO, ".ply", *_VTK))
         raise FileError(f"{path}: expected a mesh file ({known}), got suffix {suffix!r}.")
     if len(mesh.points) == 0:
         raise FileError(f"{path}: the file holds no points; it may be truncated or damaged.")
@@ -265,6 +310,53 @@ def _read(path: str | Path) -> _Mesh:
         if block.min(initial=0) < 0 or block.max(initial=0) >= len(mesh.points):
             raise FileError(f"{path}: a {name} refers to a point that is not there; the file may be damaged.")
     return mesh
+
+
+def _from_ply(path: Path) -> _Mesh:
+    try:
+        points, triangles = read_ply(path)
+    except (ValueError, KeyError, IndexError) as error:
+        raise FileError(f"{path}: could not be read as ply; the file may be truncated or damaged "
+                        f"({type(error).__name__}: {error}).") from error  # fmt: skip
+    return _Mesh(points, {"triangle": triangles} if len(triangles) else {})
+
+
+def _check_stl(path: Path) -> None:
+    """Refuse an STL that ends before it says that it does."""
+    content = path.read_bytes()
+    if content.lstrip()[:5] == b"solid" and b"facet" in content[:_HEAD]:
+        if b"endsolid" not in content[-_HEAD:]:
+            raise FileError(f"{path}: the STL is truncated: expected 'endsolid' at its end.")
+        return
+    count = int.from_bytes(content[80:84], "little")
+    if len(content) < 84 + 50 * count or len(content) < 84:
+        raise FileError(f"{path}: the STL is truncated or none: expected {84 + 50 * count} bytes for the {count} "
+                        f"triangles that it names, got {len(content)}.")  # fmt: skip
+
+
+def _from_first_msh(path: Path) -> _Mesh:
+    """MSH 1, which meshio does not read: nodes `number x y z`, elements `number type region part count nodes...`."""
+    words = path.read_text().split()
+    try:
+        nodes, elements = words.index("$NOD"), words.index("$ELM")
+        words.index("$ENDELM")
+        count = int(words[nodes + 1])
+        table = np.array(words[nodes + 2 : nodes + 2 + 4 * count], dtype=np.float64).reshape(count, 4)
+        cells, at = dict[str, list[list[int]]](), elements + 2
+        for _ in range(int(words[elements + 1])):
+            kind, size = int(words[at + 1]), int(words[at + 4])
+            corners = [int(word) for word in words[at + 5 : at + 5 + size]]
+            cells.setdefault(_FIRST_MSH.get(kind, f"MSH type {kind}"), []).append(corners)
+            at += 5 + size
+        numbers = table[:, 0].astype(np.int64)
+        order = np.argsort(numbers)
+        places = {name: order[np.searchsorted(numbers[order], np.array(block))] for name, block in cells.items()}
+        if any(not np.isin(block, numbers).all() for block in map(np.array, cells.values())):
+            raise ValueError("an element names a node that is not there")
+    except (ValueError, IndexError) as error:
+        raise FileError(f"{path}: could not be read as MSH 1; the file may be truncated or damaged ({error}); else "
+                        "save it as MSH 2 or 4.") from error  # fmt: skip
+    return _Mesh(table[:, 1:], places)
 
 
 def _from_meshio(path: Path) -> _Mesh:
@@ -361,13 +453,37 @@ def _read_table(path: Path) -> Floats:
     try:
         if path.suffix.lower() == ".npy":
             return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
-        lines = [line for line in path.read_text().replace(",", " ").replace(";", " ").splitlines() if line.strip()]
+        text = path.read_text()
+        lines = [line for line in text.replace(",", " ").replace(";", " ").splitlines() if line.strip()]
+        if not text.endswith("\n") and _is_cut(lines):
+            raise ValueError("its last number has fewer digits than all others in its column, and no line ends there")
         if lines and not _is_numeric(lines[0]):
             lines = lines[1:]  # column names, or a comment
         return np.array([line.split() for line in lines], dtype=np.float64).reshape(len(lines), -1 if lines else 3)
     except (ValueError, EOFError, OSError, UnicodeDecodeError) as error:
         raise FileError(f"{path}: expected rows of three numbers; the file may be truncated or damaged "
                         f"({error}).") from error  # fmt: skip
+
+
+def _is_cut(lines: list[str]) -> bool:
+    """True where all last numbers but that of the last line end alike (digits after the point, exponent)."""
+    ends = [re.sub(r"^[-+]?\d*", "", line.split()[-1]) for line in lines[-_LAST_LINES:]]
+    shapes = {re.sub(r"\d", "0", end).replace("-", "+") for end in ends[:-1]}
+    return len(ends) > 2 and len(shapes) == 1 and len(ends[-1]) < len(ends[0])
+
+
+def _read_pcd(path: Path) -> Floats:
+    from pypcd4.pypcd4 import PointCloud  # drags pydantic's models in: only where a PCD comes
+
+    try:
+        cloud = PointCloud.from_path(path)
+        points = np.asarray(cloud.numpy(("x", "y", "z")), dtype=np.float64)
+        if len(points) != cloud.points:
+            raise ValueError(f"expected {cloud.points} points, got {len(points)}")
+    except Exception as error:  # of pydantic, struct and lzf, each with its own
+        raise FileError(f"{path}: could not be read as pcd; the file may be truncated or damaged "
+                        f"({' '.join(str(error).split())[:200]}).") from error  # fmt: skip
+    return points[~np.isnan(points).any(axis=1)]  # NaN stands for a pixel without a measurement
 
 
 def _is_numeric(line: str) -> bool:
@@ -377,28 +493,28 @@ def _is_numeric(line: str) -> bool:
         return False
 
 
-def _surface(path: Path, mesh: _Mesh, unit: Unit, axes: Axes) -> Surface:
+def _surface(path: Path, mesh: _Mesh, unit: Unit, axes: Frame) -> Surface:
     triangles = mesh.triangles
     if len(triangles) == 0:
         raise FileError(f"{path}: expected a surface of triangles, got {mesh.content}.")
     points = mesh.points
-    if path.suffix.lower() == ".stl":
-        # An STL repeats every vertex in each of its triangles.
-        points, numbers = np.unique(points, axis=0, return_inverse=True)
-        triangles = numbers.ravel()[triangles]
+    places, numbers = np.unique(points, axis=0, return_inverse=True)
+    if len(places) < len(points):
+        # An STL repeats every vertex in each of its triangles, and so do some programs in any format.
+        points, triangles = places, numbers.ravel()[triangles]
     used, numbers = np.unique(triangles, return_inverse=True)
-    points = _in_metres(path, points[used], unit, axes, smallest=_SMALLEST)
+    points = _placed(path, points[used], unit, axes, smallest=SMALLEST)
     return Surface(points, numbers.reshape(-1, 3).astype(np.int64))
 
 
-def _volume(path: Path, mesh: _Mesh, unit: Unit, axes: Axes) -> tuple[Floats, Ints]:
+def _volume(path: Path, mesh: _Mesh, unit: Unit, axes: Frame) -> tuple[Floats, Ints]:
     kinds = [kind for kind in ("tetra", "hexahedron") if kind in mesh.cells]
     if not kinds:
         advice = "; a surface must be made solid first (softtwin build does it)" if len(mesh.triangles) else ""
         raise FileError(f"{path}: expected a volume mesh of tetrahedra or hexahedra, got {mesh.content}{advice}.")
     if len(kinds) == 2:
         raise FileError(f"{path}: expected one kind of cells, got {mesh.content}.")
-    points = _in_metres(path, mesh.points, unit, axes, smallest=_SMALLEST)
+    points = _placed(path, mesh.points, unit, axes, smallest=SMALLEST)
     return points, _turned(path, points, mesh.cells[kinds[0]])
 
 
@@ -409,13 +525,12 @@ def _turned(path: Path, points: Floats, cells: Ints) -> Ints:
     return cells[:, [0, 2, 1, 3]] if cells.shape[1] == 4 else cells[:, [4, 5, 6, 7, 0, 1, 2, 3]]
 
 
-def _in_metres(path: Path, points: Floats, unit: Unit, axes: Axes, smallest: float) -> Floats:
+def _placed(path: Path, points: Floats, unit: Unit, axes: Frame, smallest: float) -> Floats:
     if unit not in _METRES:
         raise ValueError(f"unit: expected 'm', 'cm' or 'mm', got {unit!r}.")
     if axes not in ("lps", "ras"):
         raise ValueError(f"axes: expected 'lps' or 'ras', got {axes!r}.")
-    # Dividing by a whole number rounds once; multiplying by 0.001 would round twice.
-    points = points / round(1 / _METRES[unit])
+    points = in_metres(points, unit)
     if axes == "ras":
         points = points * np.array([-1.0, -1.0, 1.0])
     _warn_size(path, float(np.ptp(points, axis=0).max()), unit, smallest)
@@ -423,12 +538,12 @@ def _in_metres(path: Path, points: Floats, unit: Unit, axes: Axes, smallest: flo
 
 
 def _warn_size(path: Path, size: float, unit: Unit, smallest: float) -> None:
-    if smallest <= size <= _LARGEST or not np.isfinite(size):
+    if smallest <= size <= LARGEST or not np.isfinite(size):
         return
-    fits = [u for u, m in _METRES.items() if smallest <= size * m / _METRES[unit] <= _LARGEST]
+    fits = [u for u, m in _METRES.items() if smallest <= size * m / _METRES[unit] <= LARGEST]
     flag = f"--unit {fits[-1]}" if fits else "--unit"
     warnings.warn(
-        f"{path} is {size:.3g} m across when read in {unit}, outside the {_SMALLEST * 1e3:g} mm to {_LARGEST:g} m of "
+        f"{path} is {size:.3g} m across when read in {unit}, outside the {SMALLEST * 1e3:g} mm to {LARGEST:g} m of "
         f"an organ; if it is in another unit, say so with {flag}.",
         UnitWarning,
         stacklevel=4,

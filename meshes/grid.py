@@ -115,7 +115,7 @@ def sparse_grid(
     on a sphere of radius R; parts across a sharp edge are each wrong by up to their own volume.
 
     Args:
-        surface: closed surface without self-intersections (not checked here, see `solidify.checked_surface`),
+        surface: closed surface without self-intersections (not checked here),
             wound outward, every vertex in use, metres.
         fixed: numbers of the attached surface vertices; all nodes of the cells that hold them become fixed.
         spacing: edge length of cubic cells, metres; the grid is centred on the surface. Give this or `cells_per_axis`.
@@ -342,14 +342,14 @@ def _check_surface(surface: Surface) -> None:
     if unused:
         raise BodyError(
             f"surface: expected every vertex to belong to a triangle, got {unused} of {count} that do not; "
-            "drop them (solidify.compacted)."
+            "drop them (checks.compacted)."
         )
     _check_closed(surface)
     flat = int((_relative_heights(surface) < _FLATTEST).sum())
     if flat:
         raise BodyError(
             f"surface: expected triangles higher than {_FLATTEST} of their longest edge, got {flat} flat ones, which "
-            "have no side; remesh it or repair it (solidify.repair)."
+            "have no side; make it solid (solidify) and take its boundary."
         )
     volume = Surface(surface.points - surface.points.mean(axis=0), surface.triangles).volume
     if not volume > 0:
@@ -377,7 +377,7 @@ def _check_closed(surface: Surface) -> None:
     if lone or again:
         raise BodyError(
             f"surface: expected a closed surface of one winding, got {lone} edges of {len(edges)} that no neighbour "
-            f"meets in the other direction and {again} met twice in one; repair it (solidify.repair)."
+            f"meets in the other direction and {again} met twice in one; make it solid (solidify), take its boundary."
         )
 
 

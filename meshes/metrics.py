@@ -15,6 +15,15 @@ HEXAHEDRON_EDGES = np.array(
     [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]]
 )
 
+_PLURALS = {
+    "triangle": "triangles",
+    "quadrilateral": "quadrilaterals",
+    "tetrahedron": "tetrahedra",
+    "hexahedron": "hexahedra",
+}
+# What makes the scaled Jacobian of a regular simplex 1, by dimension and corners.
+_REGULAR = {(3, 4): float(np.sqrt(2)), (2, 3): float(2 / np.sqrt(3))}
+
 
 @dataclass(frozen=True)
 class ErrorStatistics:
@@ -155,13 +164,13 @@ class MeshQuality:
     Args:
         nodes: number of nodes.
         cells: number of cells.
-        kind: `tetrahedra` or `hexahedra`.
-        volume: total volume, cubic metres.
+        kind: `tetrahedra` or `hexahedra`; in the plane `triangles` or `quadrilaterals`.
+        volume: total volume, cubic metres; area, square metres, in the plane.
         min_scaled_jacobian: worst cell, 1 is ideal, 0 flat.
         mean_scaled_jacobian: mean over the cells.
         min_radius_ratio: three times inradius over circumradius of the worst tetrahedron, 1 is ideal;
-            NaN for hexahedra.
-        min_dihedral: smallest angle between two faces of a cell, degrees.
+            NaN for other cells.
+        min_dihedral: smallest angle between two faces of a cell, degrees; at a corner in the plane.
         max_dihedral: largest one, degrees.
         volume_ratio: largest over smallest cell volume.
         min_edge: shortest edge, metres.
@@ -185,14 +194,18 @@ class MeshQuality:
 
     def __str__(self) -> str:
         edges = "{:.2f} / {:.2f} / {:.2f}".format(*(1e3 * x for x in (self.min_edge, self.mean_edge, self.max_edge)))
+        plane = self.kind in ("triangles", "quadrilaterals")
         rows = [
             ("nodes", f"{self.nodes}"),
             (self.kind, f"{self.cells}"),
-            ("volume", f"{self.volume * 1e3:.4g} litres"),
+            ("area", f"{self.volume * 1e4:.4g} cm^2") if plane else ("volume", f"{self.volume * 1e3:.4g} litres"),
             ("scaled Jacobian, min / mean", f"{self.min_scaled_jacobian:.3f} / {self.mean_scaled_jacobian:.3f}"),
             ("radius ratio, min", "-" if np.isnan(self.min_radius_ratio) else f"{self.min_radius_ratio:.3f}"),
-            ("dihedral angle, min / max", f"{self.min_dihedral:.1f} / {self.max_dihedral:.1f} degrees"),
-            ("cell volume, max / min", f"{self.volume_ratio:.3g}"),
+            (
+                "angle, min / max" if plane else "dihedral angle, min / max",
+                f"{self.min_dihedral:.1f} / {self.max_dihedral:.1f} degrees",
+            ),
+            ("cell area, max / min" if plane else "cell volume, max / min", f"{self.volume_ratio:.3g}"),
             ("edge, min / mean / max", f"{edges} mm"),
         ]
         return "\n".join(f"{name:<28} {value}" for name, value in rows)
@@ -210,7 +223,7 @@ def mesh_quality(body: Body) -> MeshQuality:
     return MeshQuality(
         nodes=len(body.points),
         cells=len(body.cells),
-        kind="tetrahedra" if body.is_tetrahedral else "hexahedra",
+        kind=_PLURALS[body.kind.shape],
         volume=float(volumes.sum()),
         min_scaled_jacobian=float(jacobians.min()),
         mean_scaled_jacobian=float(jacobians.mean()),
@@ -244,12 +257,15 @@ def tetrahedron_quality(points: Floats, cells: Ints) -> Floats:
 
 
 def cell_volumes(points: Floats, cells: Ints) -> Floats:
-    """Volumes of cells, (m,), cubic metres; exact for tetrahedra and for trilinear hexahedra.
+    """Volumes of cells, (m,), cubic metres; exact for tetrahedra and for trilinear hexahedra. Areas in the plane.
 
     Args:
-        points: node positions, (n, 3), metres.
-        cells: node numbers, (m, 4) or (m, 8).
+        points: node positions, (n, 3), metres; (n, 2) in the plane.
+        cells: node numbers of the corners, (m, 4) or (m, 8); (m, 3) or (m, 4) in the plane.
     """
+    if points.shape[1] == 2:
+        x, y = np.moveaxis(points[cells], 2, 0)
+        return 0.5 * (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
     if cells.shape[1] == 4:
         return corner_jacobians(points, cells)[:, 0] / 6
     # The divergence theorem over the six bilinear faces, each the mean of its two triangulations.
@@ -262,40 +278,45 @@ def cell_volumes(points: Floats, cells: Ints) -> Floats:
 
 
 def scaled_jacobians(points: Floats, cells: Ints) -> Floats:
-    """Smallest scaled Jacobian of each cell, (m,): 1 for a regular tetrahedron or a cube, 0 flat.
+    """Smallest scaled Jacobian of each cell, (m,): 1 for regular simplices, cubes and squares, 0 flat.
 
     Args:
-        points: node positions, (n, 3), metres.
-        cells: node numbers, (m, 4) or (m, 8).
+        points: node positions, (n, 3), metres; (n, 2) in the plane.
+        cells: node numbers of the corners, (m, 4) or (m, 8); (m, 3) or (m, 4) in the plane.
     """
-    tetrahedral = cells.shape[1] == 4
-    local = TETRAHEDRON_EDGES if tetrahedral else HEXAHEDRON_EDGES
+    local = _local_edges(points, cells)
     edges = points[cells[:, local[:, 1]]] - points[cells[:, local[:, 0]]]
     lengths = np.linalg.norm(edges, axis=2)
     meeting = np.array([np.flatnonzero((local == corner).any(axis=1)) for corner in range(cells.shape[1])])
     scaled = corner_jacobians(points, cells) / lengths[:, meeting].prod(axis=2)
-    return scaled.min(axis=1) * (np.sqrt(2) if tetrahedral else 1.0)
+    return scaled.min(axis=1) * _REGULAR.get((points.shape[1], cells.shape[1]), 1.0)
 
 
 def edge_lengths(points: Floats, cells: Ints) -> Floats:
     """Lengths of the edges of a mesh, each edge once, metres.
 
     Args:
-        points: node positions, (n, 3), metres.
-        cells: node numbers, (m, 4) or (m, 8).
+        points: node positions, (n, 3), metres; (n, 2) in the plane.
+        cells: node numbers of the corners, (m, 4) or (m, 8); (m, 3) or (m, 4) in the plane.
     """
-    local = TETRAHEDRON_EDGES if cells.shape[1] == 4 else HEXAHEDRON_EDGES
-    edges = np.unique(np.sort(cells[:, local].reshape(-1, 2), axis=1), axis=0)
+    edges = np.unique(np.sort(cells[:, _local_edges(points, cells)].reshape(-1, 2), axis=1), axis=0)
     return np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
 
 
 def dihedral_angles(points: Floats, cells: Ints) -> Floats:
-    """Angles between the faces that meet at the edges of each cell, (m, 6) or (m, 12), degrees.
+    """Angles between the faces that meet at the edges of each cell, (m, 6) or (m, 12); corner angles in the plane.
+
+    All in degrees.
 
     Args:
-        points: node positions, (n, 3), metres.
-        cells: node numbers, (m, 4) or (m, 8).
+        points: node positions, (n, 3), metres; (n, 2) in the plane.
+        cells: node numbers of the corners, (m, 4) or (m, 8); (m, 3) or (m, 4) in the plane.
     """
+    if points.shape[1] == 2:
+        ahead = np.roll(points[cells], -1, axis=1) - points[cells]
+        back = -np.roll(ahead, 1, axis=1)
+        cross = ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0]
+        return np.degrees(np.arctan2(cross, (ahead * back).sum(axis=2))) % 360.0
     local = TETRAHEDRON_FACES if cells.shape[1] == 4 else HEXAHEDRON_FACES
     corners = points[cells[:, local]]
     # The diagonals' product is the mean normal of a quadrilateral, and twice the area vector of a triangle.
@@ -308,6 +329,13 @@ def dihedral_angles(points: Floats, cells: Ints) -> Floats:
     first, second = _face_pairs(local)
     cosines = np.einsum("mei,mei->me", normals[:, first], normals[:, second])
     return 180.0 - np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def _local_edges(points: Floats, cells: Ints) -> Ints:
+    if points.shape[1] == 2:
+        corners = np.arange(cells.shape[1])
+        return np.column_stack([corners, np.roll(corners, -1)])
+    return TETRAHEDRON_EDGES if cells.shape[1] == 4 else HEXAHEDRON_EDGES
 
 
 def _face_pairs(faces: Ints) -> tuple[Ints, Ints]:

@@ -11,7 +11,7 @@ from vtkmodules.vtkCommonDataModel import vtkImageData
 from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D
 
 from .body import Body, Floats, Ints, Surface
-from .solidify import fill, gmsh_model, solidify
+from .filling import fill, filled, gmsh_model
 
 # Six tetrahedra around the diagonal 0-6 of a hexahedron (Kuhn): copies side by side share their faces.
 _KUHN = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]])
@@ -145,7 +145,7 @@ def liver_phantom(cell_size: float = 0.0095) -> Body:
     if not 0.002 <= cell_size <= 0.02:
         raise ValueError(f"cell_size: expected 0.002 to 0.02 m for the liver phantom, got {cell_size}.")
     outline = _isosurface(_liver, (-0.115, -0.085, -0.095), (0.12, 0.085, 0.085), spacing=0.004)
-    points, cells = solidify(outline, cell_size=cell_size)
+    points, cells = filled(outline, cell_size)
     inner = {
         "vessel_portal": _vessel(_PORTAL),
         "vessel_hepatic": _vessel(_HEPATIC),

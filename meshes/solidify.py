@@ -1,147 +1,152 @@
-"""A closed triangle surface made solid: checks, repair, tetrahedra of a wanted size or number of nodes."""
+"""Any triangle surface made solid: put in order, thinned, filled by fTetWild, its worst cells mended, and all said."""
 
 from __future__ import annotations
 
 import logging
-import threading
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkFiltersCore import vtkQuadricDecimation
 
 from .body import Floats, Ints, Surface
-from .metrics import tetrahedron_quality
+from .checks import Defects, SurfaceError, compacted, piece_numbers, put_in_order
+from .closest import distances, polydata
+from .metrics import cell_volumes, tetrahedron_quality
+from .smoothing import Flags, improved, outer_faces, used_points
+from .tetwild import tetrahedra
 
 _log = logging.getLogger(__name__)
-_GMSH_LOCK = threading.RLock()  # gmsh has one global state
-_TETRAHEDRON, _TRIANGLE = 4, 2  # gmsh's element types
+MOST_NODES = 200_000  # fTetWild would take hours for more, and a wrong unit asks for billions
 _LOWEST_QUALITY = 1e-3  # radius ratio below which a tetrahedron is a sliver that no solver should meet
-_SEARCHES = 6
-_COUNT_TOLERANCE = 0.03
-_FEWEST_VERTICES = 30
-_VERTICES_PER_CLUSTER = 10  # of the surface before remeshing, for clusters of even size
+_GOOD_JACOBIAN = 0.25  # scaled: cells below are mended where that goes
+# How far the boundary may lie from the surface: this part of its size, or for coarse cells this part of their edge.
+_TOLERANCE, _TOLERANCE_OF_EDGE = 3e-3, 0.08
+_TRIANGLE_EDGE = (
+    0.6  # of the cells' edge: finer triangles cost time (96 s in place of 6) and are coarsened all the same
+)
+_EDGE_RATIO = 1.4  # fTetWild's wanted edge over the mean edge that it makes
+# Nodes are about this times volume / size^3 and this times area / size^2 (measured on organ surfaces).
+_NODES_IN_CUBE, _NODES_ON_SQUARE = 0.72, 1.44
+_LEFT_OUT = 0.01  # of the surface's size: a component whose median point lies farther from the solid is not in it
+_SEARCHES = 5
+_COUNT_TOLERANCE = 0.15
+_SLOPE = 2.2  # nodes fall with this power of the cell size: 3 inside, 2 on the surface, less where details bind
+_UNPINCHES = 20
 
 
-class SurfaceError(ValueError):
-    """A surface that cannot be made solid: the message says what is wrong with it and what to do."""
-
-
-@contextmanager
-def gmsh_model(name: str) -> Iterator[Any]:
-    """A fresh gmsh model: silent, one thread (so the same input gives the same mesh), gone afterwards.
+@dataclass(frozen=True)
+class Mending:
+    """What was done to a surface on its way to a solid; print it for a readable list.
 
     Args:
-        name: the model's name.
-
-    Raises:
-        ImportError: gmsh is not installed.
+        defects: what was wrong with the surface.
+        dropped: volumes of the components left out, largest first, cubic metres.
+        volume_before: of the surface, holes closed flat, cubic metres, with components left out.
+        volume_after: of the solid, cubic metres.
+        distance: largest distance between the surface (holes closed) and the solid's boundary, either way, metres.
+        mean_distance: mean of both ways, metres.
     """
-    try:
-        import gmsh  # here only: beams and surfaces must work where gmsh is not installed
-    except (ImportError, OSError) as error:
-        raise ImportError(f"gmsh is needed to make tetrahedra and could not be loaded ({error}); "
-                          "install softtwin[mesh].") from error  # fmt: skip
-    with _GMSH_LOCK:
-        # Without interruptible=False gmsh takes over Ctrl-C, which fails outside the main thread.
-        gmsh.initialize(["-nopopup"], readConfigFiles=False, interruptible=False)
-        try:
-            gmsh.option.setNumber("General.Terminal", 0)
-            gmsh.option.setNumber("General.NumThreads", 1)
-            gmsh.option.setNumber("Mesh.RandomSeed", 1)
-            gmsh.model.add(name)
-            yield gmsh
-        finally:
-            gmsh.finalize()
+
+    defects: Defects
+    dropped: tuple[float, ...]
+    volume_before: float
+    volume_after: float
+    distance: float
+    mean_distance: float
+
+    def __str__(self) -> str:
+        d = self.defects
+        said = [
+            (d.merged_vertices, f"{d.merged_vertices} vertices merged with others at the same place"),
+            (d.degenerate_triangles, f"{d.degenerate_triangles} triangles without area or there twice left out"),
+            (d.open_edges, f"{d.holes} holes ({d.open_edges} open edges) closed"),
+            (d.crowded_edges, f"{d.crowded_edges} edges of more than two triangles resolved"),
+            (d.clashing_edges, f"{d.clashing_edges} edges between triangles of opposite winding: turned alike"),
+            (d.winds_inward, "triangles wound inward: turned outward"),
+            (len(self.dropped), f"{len(self.dropped)} components left out, the largest {_millilitres(self.dropped)}"),
+        ]
+        lines = [line for holds, line in said if holds] or ["nothing was wrong with the surface"]
+        share = (self.volume_after + sum(self.dropped)) / self.volume_before
+        lines += [
+            f"volume before {1e6 * self.volume_before:.5g} ml, after {1e6 * self.volume_after:.5g} ml"
+            + (f", with what was left out {share:.4f} of it" if self.dropped else f" ({share:.4f} of it)"),
+            f"moved at most {1e3 * self.distance:.2f} mm, {1e3 * self.mean_distance:.3f} mm on average",
+        ]
+        return "\n".join(f"surface: {line}" for line in lines)
 
 
-def solidify(
-    surface: Surface, cell_size: float | None = None, node_count: int | None = None, *, remesh: bool = True
-) -> tuple[Floats, Ints]:
-    """Tetrahedra that fill a closed surface.
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """Tetrahedra that fill a surface, and what was done to it.
 
     Args:
-        surface: closed triangle surface, metres; an inside-out one is turned.
-        cell_size: wanted edge length, metres. Give this or `node_count`.
-        node_count: wanted number of nodes; the edge length is searched, the number met within a few per cent
-            where the surface allows it (the number reached is the length of the points returned, and is logged).
-        remesh: True to remesh the surface with the same edge length, False to keep its triangles and nodes.
+        points: node positions, (n, 3), metres.
+        cells: node numbers, (m, 4).
+        mending: what was done.
+    """
 
-    Returns:
-        points (n, 3) in metres and cells (m, 4).
+    points: Floats
+    cells: Ints
+    mending: Mending
+
+
+def solidify(surface: Surface, cell_size: float | None = None, node_count: int | None = None) -> Solid:
+    """Tetrahedra that fill what a surface encloses, whatever its defects: holes, crumbs, overlaps, any winding.
+
+    Of several components the largest is kept. The mesh is another one at each call (see `tetwild.tetrahedra`).
+
+    Args:
+        surface: triangle surface, metres.
+        cell_size: wanted mean edge length, metres. Give this or `node_count`.
+        node_count: wanted number of nodes; the edge length is searched until the number is met within 15 %, with
+            at most 5 meshes (the number reached is the length of the points returned, and is logged).
 
     Raises:
-        SurfaceError: the surface is open, not manifold, intersects itself, has several components, or gives slivers.
-        ValueError: neither or both of `cell_size` and `node_count`, or one not positive.
+        SurfaceError: no solid came, or only one with slivers.
+        ValueError: neither or both of `cell_size` and `node_count`, one out of its range, or more nodes than
+            `MOST_NODES`.
     """
     _check_wish(cell_size, node_count)
-    surface = checked_surface(surface)
+    ordered, defects = put_in_order(surface)
+    if not ordered.volume > 0:
+        raise SurfaceError(
+            "surface: expected triangles that enclose a volume, got none; is it a sheet, or open on one side?"
+        )
     if cell_size is None:
         assert node_count is not None
-        points, cells = _search_size(surface, node_count, remesh)
+        points, cells = _search_size(ordered, node_count)
     else:
-        points, cells = _tetrahedra(surface, cell_size, remesh)
-    _check_slivers(points, cells, remesh)
-    return points, cells
+        check_node_count(ordered, cell_size)
+        points, cells = _filled(ordered, cell_size)
+    worst = float(tetrahedron_quality(points, cells).min())
+    if worst < _LOWEST_QUALITY:
+        raise SurfaceError(
+            f"surface: expected tetrahedra with a radius ratio of at least {_LOWEST_QUALITY:g}, the worst has "
+            f"{worst:.2g}; try another number of nodes or cell size."
+        )
+    return Solid(points, cells, _mending(ordered, defects, points, cells))
 
 
-def checked_surface(surface: Surface) -> Surface:
-    """The surface, compacted and wound outward, if it can be made solid.
-
-    Args:
-        surface: triangle surface, metres.
-
-    Raises:
-        SurfaceError: see `solidify`.
-    """
-    surface = compacted(surface)
-    _check_edges(surface)
-    _check_components(surface)
-    if surface.volume < 0:
-        _log.info("the surface was inside out; its triangles were turned outward")
-        surface = Surface(surface.points, surface.triangles[:, ::-1])
-    _check_intersections(surface)
-    return surface
-
-
-def repair(surface: Surface) -> Surface:
-    """A closed surface made from a damaged one by MeshFix: holes filled, overlaps cut, the largest component kept.
+def check_node_count(surface: Surface, cell_size: float) -> None:
+    """Refuse a cell size that would make more nodes than `MOST_NODES`.
 
     Args:
-        surface: triangle surface, metres.
+        surface: closed surface, metres.
+        cell_size: edge length, metres.
 
     Raises:
-        SurfaceError: nothing was left, or what was left is still not fit.
-        ImportError: pymeshfix is not installed.
+        ValueError: with the number of nodes that would come.
     """
-    from pymeshfix import MeshFix  # of the extra `mesh`, wanted only here and for the intersections
-
-    surface = compacted(surface)
-    fix = MeshFix(surface.points, surface.triangles.astype(np.int32))
-    fix.repair()
-    if len(fix.faces) == 0:
-        raise SurfaceError("surface: repair left no triangles; expected a surface that encloses a volume.")
-    return checked_surface(Surface(np.asarray(fix.points), np.asarray(fix.faces)))
-
-
-def compacted(surface: Surface) -> Surface:
-    """The surface without vertices that no triangle uses and without triangles that use a vertex twice.
-
-    Args:
-        surface: triangle surface, metres.
-
-    Raises:
-        SurfaceError: no triangle is left.
-    """
-    corners = np.sort(surface.triangles, axis=1)
-    triangles = surface.triangles[(np.diff(corners, axis=1) != 0).all(axis=1)]
-    if len(triangles) == 0:
-        raise SurfaceError("surface: expected triangles with three different corners, got none.")
-    used, numbers = np.unique(triangles, return_inverse=True)
-    return Surface(surface.points[used], numbers.reshape(-1, 3))
+    count = _node_estimate(surface, cell_size)
+    if count > MOST_NODES:
+        raise ValueError(
+            f"cell_size: {cell_size:g} m in a surface {np.ptp(surface.points, axis=0).max():.3g} m across makes about "
+            f"{count:.2g} nodes, expected at most {MOST_NODES}; is the surface in another unit (--unit mm)? "
+            "cell_size is in metres."
+        )
 
 
 def _check_wish(cell_size: float | None, node_count: int | None) -> None:
@@ -149,166 +154,185 @@ def _check_wish(cell_size: float | None, node_count: int | None) -> None:
         raise ValueError("solidify: expected one of cell_size and node_count, got neither or both.")
     if cell_size is not None and not 0 < cell_size < np.inf:
         raise ValueError(f"cell_size: expected a positive length in metres, got {cell_size}.")
-    if node_count is not None and node_count < 20:
-        raise ValueError(f"node_count: expected at least 20, got {node_count}.")
+    if node_count is not None and not 20 <= node_count <= MOST_NODES:
+        raise ValueError(f"node_count: expected 20 to {MOST_NODES}, got {node_count}.")
 
 
-def _edges(triangles: Ints) -> Ints:
-    return triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+def _node_estimate(surface: Surface, cell_size: float) -> float:
+    return abs(surface.volume) * _NODES_IN_CUBE / cell_size**3 + surface.area * _NODES_ON_SQUARE / cell_size**2
 
 
-def _check_edges(surface: Surface) -> None:
-    edges = _edges(surface.triangles)
-    _, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
-    open_edges, crowded = int((counts == 1).sum()), int((counts > 2).sum())
-    if open_edges:
-        raise SurfaceError(
-            f"surface: expected a closed surface, got {open_edges} open edges (edges of one triangle only) of "
-            f"{len(counts)}; close the holes in the segmentation tool, or repair it (--repair)."
-        )
-    if crowded:
-        raise SurfaceError(
-            f"surface: expected a manifold surface, got {crowded} edges shared by more than two triangles; "
-            "repair it (--repair)."
-        )
-    if len(np.unique(edges, axis=0)) < len(edges):
-        raise SurfaceError("surface: expected one winding, got neighbouring triangles that wind against each other; "
-                           "repair it (--repair).")  # fmt: skip
+def _size_estimate(surface: Surface, node_count: int) -> float:
+    roots = np.roots([node_count, 0.0, -surface.area * _NODES_ON_SQUARE, -abs(surface.volume) * _NODES_IN_CUBE])
+    return float(roots[np.isreal(roots)].real.max())
 
 
-def _check_components(surface: Surface) -> None:
-    edges = _edges(surface.triangles)
-    n = len(surface.points)
-    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    count, labels = connected_components(graph, directed=False)
-    if count > 1:
-        sizes = np.sort(np.bincount(labels[surface.triangles[:, 0]]))[::-1]
-        raise SurfaceError(
-            f"surface: expected one component, got {count} with {sizes[:5].tolist()} triangles; "
-            "repair it (--repair keeps the largest) or build one body each."
-        )
-
-
-def intersecting_triangles(surface: Surface) -> Ints:
-    """Numbers of the triangles that cut through another triangle of the surface, sorted.
-
-    Args:
-        surface: triangle surface, metres.
-
-    Raises:
-        ImportError: pymeshfix is not installed.
-    """
-    from pymeshfix import PyTMesh
-
-    mesh = PyTMesh()
-    mesh.set_quiet(True)
-    mesh.load_array(surface.points, surface.triangles.astype(np.int32))
-    return np.unique(np.asarray(mesh.select_intersecting_triangles(), dtype=np.int64))
-
-
-def _check_intersections(surface: Surface) -> None:
-    count = len(intersecting_triangles(surface))
-    if count:
-        raise SurfaceError(
-            f"surface: expected a surface that does not intersect itself, got {count} of {len(surface.triangles)} "
-            "triangles that cut others; repair it (--repair)."
-        )
-
-
-def _search_size(surface: Surface, node_count: int, remesh: bool) -> tuple[Floats, Ints]:
-    # A tetrahedron of a good mesh has about 0.11 h^3, a node has about 5 tetrahedra.
-    size = (surface.volume / (0.11 * 5 * node_count)) ** (1 / 3)
-    best: tuple[Floats, Ints] | None = None
+def _search_size(surface: Surface, node_count: int) -> tuple[Floats, Ints]:
+    size, found = _size_estimate(surface, node_count), dict[float, tuple[Floats, Ints]]()
     for _ in range(_SEARCHES):
-        found = _tetrahedra(surface, size, remesh)
-        if best is None or abs(len(found[0]) - node_count) < abs(len(best[0]) - node_count):
-            best = found
-        ratio = len(found[0]) / node_count
-        if abs(ratio - 1) <= _COUNT_TOLERANCE:
+        found[size] = _filled(surface, size)
+        count = len(found[size][0])
+        _log.info("cells of %.3g mm give %d nodes, wanted %d", 1e3 * size, count, node_count)
+        if abs(count / node_count - 1) <= _COUNT_TOLERANCE:
             break
-        size *= ratio ** (1 / 2.7)  # between 3 (all nodes inside) and 2 (all nodes on the surface)
-    assert best is not None
-    _log.info("asked for %d nodes, made %d", node_count, len(best[0]))
-    return best
+        surface = _without(surface, _left_out(surface, *found[size])[0])  # what is left out need not be meshed again
+        size = _next_size({tried: len(mesh[0]) for tried, mesh in found.items()}, node_count)
+    return min(found.values(), key=lambda mesh: abs(np.log(len(mesh[0]) / node_count)))
 
 
-def _tetrahedra(surface: Surface, size: float, remesh: bool) -> tuple[Floats, Ints]:
-    if remesh:
-        surface = _remeshed(surface, size)
-    with gmsh_model("solid") as gmsh:
-        _load(gmsh, surface)
-        faces = [tag for _, tag in gmsh.model.getEntities(2)]
-        gmsh.model.geo.addVolume([gmsh.model.geo.addSurfaceLoop(faces)])
-        gmsh.model.geo.synchronize()
-        try:
-            return fill(gmsh, size)
-        except Exception as error:  # gmsh raises bare Exceptions
-            raise SurfaceError(
-                f"surface: gmsh could not fill it with cells of {size * 1e3:.3g} mm ({error}); "
-                "try another cell size, remesh on or off, or repair it (--repair)."
-            ) from error
+def _next_size(counts: dict[float, int], wanted: int) -> float:
+    """The cell size to try next, from the numbers of nodes that others gave: a straight line through logarithms."""
+    small = max((size for size, count in counts.items() if count >= wanted), default=None)
+    large = min((size for size, count in counts.items() if count < wanted), default=None)
+    if small is not None and large is not None and small < large:
+        part = np.log(wanted / counts[large]) / np.log(counts[small] / counts[large])
+        return float(large * (small / large) ** part)
+    last = list(counts)[-1]
+    return float(last * (counts[last] / wanted) ** (1 / _SLOPE))
 
 
-def _remeshed(surface: Surface, size: float) -> Surface:
-    # Clustering (ACVD) never hangs; gmsh's own remeshing does, when it cannot flatten a patch with tiny triangles.
-    import pyacvd
-    import pyvista
-
-    count = max(int(surface.area / (size**2 * np.sqrt(3) / 2)), _FEWEST_VERTICES)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # pyacvd uses a name that pyvista deprecates
-        make: Any = pyvista.PolyData.from_regular_faces  # its stubs refuse float64
-        clusters = pyacvd.Clustering(make(surface.points, surface.triangles))
-        rounds = np.ceil(np.log(_VERTICES_PER_CLUSTER * count / len(surface.points)) / np.log(4))
-        if rounds > 0:
-            clusters.subdivide(int(rounds))
-        clusters.cluster(count)
-        mesh = clusters.create_mesh()
-    try:
-        return checked_surface(Surface(np.asarray(mesh.points, float), np.asarray(mesh.regular_faces)))
-    except SurfaceError as error:
-        raise SurfaceError(
-            f"surface: remeshed with triangles of {size * 1e3:.3g} mm it lost its shape ({error}); "
-            "choose smaller cells, or no remeshing."
-        ) from error
+def _filled(surface: Surface, cell_size: float) -> tuple[Floats, Ints]:
+    thinned = _thinned(surface, _TRIANGLE_EDGE * cell_size)
+    tolerance = max(_TOLERANCE * _size(surface), _TOLERANCE_OF_EDGE * cell_size)
+    points, cells = tetrahedra(thinned, _EDGE_RATIO * cell_size, tolerance)
+    if len(cells) == 0:
+        raise SurfaceError("surface: fTetWild found nothing inside it; is it a sheet, or open on one side?")
+    cells = _unpinched(points, _largest(points, cells))
+    return improved(*used_points(points, cells), _GOOD_JACOBIAN)
 
 
-def _load(gmsh: Any, surface: Surface) -> None:
-    entity = gmsh.model.addDiscreteEntity(2)
-    gmsh.model.mesh.addNodes(2, entity, np.arange(1, len(surface.points) + 1), surface.points.ravel())
-    gmsh.model.mesh.addElementsByType(entity, _TRIANGLE, [], (surface.triangles + 1).ravel())
+def _size(surface: Surface) -> float:
+    return float(np.linalg.norm(np.ptp(surface.points, axis=0)))
 
 
-def fill(gmsh: Any, size: float) -> tuple[Floats, Ints]:
-    """Points (n, 3) and tetrahedra (m, 4) of a model's volumes, optimised against slivers by gmsh and Netgen.
-
-    Args:
-        gmsh: the gmsh module with a current model.
-        size: edge length, in the model's unit.
-
-    Raises:
-        ValueError: gmsh made no tetrahedra.
-    """
-    gmsh.option.setNumber("Mesh.MeshSizeMin", size)
-    gmsh.option.setNumber("Mesh.MeshSizeMax", size)
-    gmsh.option.setNumber("Mesh.Optimize", 1)
-    gmsh.model.mesh.generate(3)
-    gmsh.model.mesh.optimize("Netgen")
-    tags, coordinates, _ = gmsh.model.mesh.getNodes()
-    _, corners = gmsh.model.mesh.getElementsByType(_TETRAHEDRON)
-    if len(corners) == 0:
-        raise ValueError("gmsh made no tetrahedra")
-    order = np.argsort(tags)
-    cells = order[np.searchsorted(tags, corners, sorter=order)].reshape(-1, 4)
-    used, numbers = np.unique(cells, return_inverse=True)
-    return coordinates.reshape(-1, 3)[used], numbers.reshape(-1, 4).astype(np.int64)
+def _thinned(surface: Surface, edge: float) -> Surface:
+    """The surface with about as many triangles as have this edge length, each where it changes the shape least."""
+    count = surface.area / (np.sqrt(3) / 4 * edge**2)
+    if count >= len(surface.triangles):
+        return surface
+    decimation = vtkQuadricDecimation()
+    decimation.SetInputData(polydata(surface))
+    decimation.SetTargetReduction(1 - count / len(surface.triangles))
+    decimation.VolumePreservationOn()
+    decimation.Update()
+    mesh = decimation.GetOutput()
+    if mesh.GetNumberOfPolys() == 0:
+        return surface
+    triangles = vtk_to_numpy(mesh.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
+    return compacted(Surface(vtk_to_numpy(mesh.GetPoints().GetData()).astype(np.float64), triangles))
 
 
-def _check_slivers(points: Floats, cells: Ints, remesh: bool) -> None:
-    worst = float(tetrahedron_quality(points, cells).min())
-    if worst < _LOWEST_QUALITY:
-        advice = "repair it (--repair) or choose another cell size" if remesh else "let it be remeshed"
-        raise SurfaceError(
-            f"surface: expected tetrahedra with a radius ratio of at least {_LOWEST_QUALITY:g}, "
-            f"the worst has {worst:.2g}; {advice}."
-        )
+def _largest(points: Floats, cells: Ints) -> Ints:
+    """The cells of the component of the largest volume (by faces)."""
+    labels = _by_faces(cells)
+    return cells[labels == np.bincount(labels, cell_volumes(points, cells)).argmax()]
+
+
+def _by_faces(cells: Ints) -> Ints:
+    """Number of each cell's component: cells that hang together by their faces, (m,)."""
+    faces, outer = outer_faces(cells)
+    shared = np.flatnonzero(~outer.ravel())
+    order = np.lexsort(np.sort(faces.reshape(-1, 3)[shared], axis=1).T)
+    pairs = shared[order].reshape(-1, 2) // 4
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def _unpinched(points: Floats, cells: Ints) -> Ints:
+    """Cells without the smaller parts that touch the rest in an edge or a node only: such a part would turn freely."""
+    for _ in range(_UNPINCHES):
+        gone = _pinched(points, cells)
+        if len(gone) == 0:
+            break
+        cells = _largest(points, np.delete(cells, gone, axis=0))
+    return cells
+
+
+def _pinched(points: Floats, cells: Ints) -> Ints:
+    """Cells around edges of four boundary triangles, and around nodes, that hang together with most of them nowhere."""
+    faces, outer = outer_faces(cells)
+    triangles = faces[outer]
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    pairs, counts = np.unique(edges, axis=0, return_counts=True)
+    groups = [np.flatnonzero(np.isin(cells, pair).sum(axis=1) == 2) for pair in pairs[counts > 2]]
+    groups += [np.flatnonzero((cells == node).any(axis=1)) for node in _nodes_of_two_fans(triangles)]
+    volumes = cell_volumes(points, cells)
+    return np.unique(np.concatenate([np.empty(0, np.int64), *(_lesser(cells, group, volumes) for group in groups)]))
+
+
+def _nodes_of_two_fans(triangles: Ints) -> Ints:
+    """Nodes whose boundary triangles do not all hang together by edges at the node."""
+    count = len(triangles)
+    corners = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    places = np.tile([0, 1, 1, 2, 2, 0], (count, 1)) + 3 * np.arange(count)[:, None]  # corner k of triangle t: 3 t + k
+    turned = corners[:, 0] > corners[:, 1]
+    corners, places = (np.where(turned[:, None], x[:, ::-1], x) for x in (corners, places.reshape(-1, 2)))
+    order = np.lexsort(corners.T)
+    alike = (corners[order][1:] == corners[order][:-1]).all(axis=1)
+    pairs = np.concatenate(
+        [np.column_stack([places[order][:-1][alike, end], places[order][1:][alike, end]]) for end in (0, 1)]
+    )
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(3 * count, 3 * count))
+    _, fans = connected_components(graph, directed=False)
+    owners = np.unique(np.column_stack([triangles.ravel(), fans]), axis=0)[:, 0]
+    nodes, counts = np.unique(owners, return_counts=True)
+    return nodes[counts > 1]
+
+
+def _lesser(cells: Ints, chosen: Ints, volumes: Floats) -> Ints:
+    """Of the chosen cells those that do not hang, by faces, together with the largest part."""
+    labels = _by_faces(cells[chosen])
+    return chosen[labels != np.bincount(labels, volumes[chosen]).argmax()]
+
+
+def _mending(surface: Surface, defects: Defects, points: Floats, cells: Ints) -> Mending:
+    pieces = piece_numbers(surface)
+    far, back = _left_out(surface, points, cells)
+    there = distances(surface, _samples(_boundary(points, cells)))
+    kept = back[~far[_sample_pieces(surface, pieces)]]
+    return Mending(
+        defects=defects,
+        dropped=tuple(np.sort(_volumes(surface, pieces)[far])[::-1].tolist()),
+        volume_before=surface.volume,
+        volume_after=float(cell_volumes(points, cells).sum()),
+        distance=float(max(there.max(), kept.max())),
+        mean_distance=float((there.mean() + kept.mean()) / 2),
+    )
+
+
+def _left_out(surface: Surface, points: Floats, cells: Ints) -> tuple[Flags, Floats]:
+    """Which components of a surface the solid does not follow, and the distances of the surface's samples to it."""
+    away = distances(_boundary(points, cells), _samples(surface))
+    pieces = piece_numbers(surface)
+    order = np.argsort(_sample_pieces(surface, pieces), kind="stable")
+    groups = np.split(away[order], np.cumsum(np.bincount(_sample_pieces(surface, pieces)))[:-1])
+    return np.array([np.median(group) for group in groups]) > _LEFT_OUT * _size(surface), away
+
+
+def _without(surface: Surface, far: Flags) -> Surface:
+    pieces = piece_numbers(surface)
+    return compacted(Surface(surface.points, surface.triangles[~far[pieces[surface.triangles[:, 0]]]]))
+
+
+def _boundary(points: Floats, cells: Ints) -> Surface:
+    faces, outer = outer_faces(cells)
+    return compacted(Surface(points, faces[outer]))
+
+
+def _sample_pieces(surface: Surface, pieces: Ints) -> Ints:
+    return np.concatenate([pieces, pieces[surface.triangles[:, 0]]])
+
+
+def _volumes(surface: Surface, pieces: Ints) -> Floats:
+    """Volume that each piece encloses, cubic metres."""
+    corners = (surface.points - surface.points.mean(axis=0))[surface.triangles]
+    six = np.einsum("ti,ti->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    return np.bincount(pieces[surface.triangles[:, 0]], six) / 6
+
+
+def _samples(surface: Surface) -> Floats:
+    return np.concatenate([surface.points, surface.points[surface.triangles].mean(axis=1)])
+
+
+def _millilitres(volumes: tuple[float, ...]) -> str:
+    return f"{1e6 * volumes[0]:.4g} ml" if volumes else ""

@@ -15,8 +15,7 @@ import pytest
 import pyvista
 
 from softtwin.app.cli import main
-from softtwin.app.config import BodySection, Config, to_toml
-from softtwin.app.organ import make_body
+from softtwin.app.config import Config, to_toml
 from softtwin.app.register import forward_model, make_registrar, open_twin, register_clouds
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
@@ -102,22 +101,6 @@ def test_config_writes_a_file_that_mesh_takes(capsys, tmp_path: Path) -> None:
     assert "mesh" in json.loads((tmp_path / "twin-run" / "stages.json").read_text())
 
 
-def test_a_surface_in_millimetres_becomes_a_body_in_metres(sphere: Path, cap: Path) -> None:
-    section = BodySection(source=str(sphere), unit="mm", fixed=str(cap), nodes=300)
-    body = make_body(section, Path("."))
-    assert body.volume == pytest.approx(4 / 3 * np.pi * 0.05**3, rel=0.05)  # an inscribed polyhedron is smaller
-    assert body.points[body.fixed, 2].max() < -0.02
-
-
-def test_lone_listed_nodes_are_not_an_attachment() -> None:
-    """An attachment is a surface: a listed node without a whole listed triangle is left free."""
-    bare = beam((6, 2, 2), (0.6, 0.2, 0.2), "tetrahedron")
-    from softtwin.app.organ import _attached
-
-    lone = int(bare.node_sets["tip"][0])
-    assert np.array_equal(_attached(bare, np.append(bare.fixed, lone)), bare.fixed)
-
-
 def build(capsys, tmp_path: Path, *arguments: object) -> str:
     return run(capsys, "build", *arguments, "--output", tmp_path / "out", code=2)
 
@@ -130,35 +113,6 @@ def test_a_fixed_set_far_from_the_boundary_is_said_with_the_distance(capsys, tmp
     np.savetxt(tmp_path / "far.txt", np.full((5, 3), 300.0) + np.eye(5)[:, :3])
     said = build(capsys, tmp_path, sphere, "--unit", "mm", "--nodes", 200, "--fixed", tmp_path / "far.txt")
     assert "no boundary node lies within" in said and "mm away" in said
-
-
-@pytest.mark.filterwarnings("default::softtwin.meshes.files.UnitWarning")
-def test_millimetres_read_as_metres_are_warned_of(capsys, tmp_path, sphere, cap) -> None:
-    said = build(capsys, tmp_path, sphere, "--nodes", 200)
-    assert "warning" in said and "--unit mm" in said and "100" in said
-
-
-def test_an_open_surface_is_refused(capsys, tmp_path, cap) -> None:
-    points, triangles = ball()
-    path = write_stl(tmp_path / "open.stl", points, triangles[20:])
-    said = build(capsys, tmp_path, path, "--unit", "mm", "--fixed", cap)
-    assert "open" in said and "repair" in said
-
-
-def test_two_components_are_refused(capsys, tmp_path, cap) -> None:
-    points, triangles = ball()
-    both = np.vstack([points, points + np.array([200.0, 0.0, 0.0])])
-    path = write_stl(tmp_path / "two.stl", both, np.vstack([triangles, triangles + len(points)]))
-    said = build(capsys, tmp_path, path, "--unit", "mm", "--fixed", cap)
-    assert "component" in said and "2" in said
-
-
-def test_a_self_intersecting_surface_is_refused(capsys, tmp_path, cap) -> None:
-    points, triangles = ball()
-    points[points[:, 2] > 30.0, 2] -= 110.0
-    path = write_stl(tmp_path / "folded.stl", points, triangles)
-    said = build(capsys, tmp_path, path, "--unit", "mm", "--fixed", cap)
-    assert "intersect" in said
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from softtwin.meshes.files import (
     read_mesh,
     read_surface,
     read_volume,
+    stated_frame,
     write_body,
     write_deformed,
 )
@@ -287,6 +288,95 @@ def test_a_damaged_cloud_is_refused(name: str, content: str, message: str, tmp_p
     (tmp_path / name).write_text(content)
     with pytest.raises(FileError, match=message):
         read_cloud(tmp_path / name)
+
+
+def test_unshared_vertices_are_merged_in_any_format(tmp_path: Path, ball: Surface) -> None:
+    points = ball.points[ball.triangles].reshape(-1, 3)
+    torn = Surface(points, np.arange(len(points)).reshape(-1, 3))
+    for suffix in (".obj", ".ply", ".vtk"):
+        surface = read_surface(_save(tmp_path / f"torn{suffix}", torn))
+        assert len(surface.points) == len(ball.points) and surface.volume == pytest.approx(ball.volume, rel=1e-9)
+
+
+@pytest.mark.parametrize("kept", [0.5, 0.99])
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_truncated_stl_is_called_truncated(binary: bool, kept: float, tmp_path: Path, ball: Surface) -> None:
+    path = _save(tmp_path / "ball.stl", ball, binary=binary)
+    lines = path.read_bytes()
+    # An STL as text is cut after a whole facet, where nothing but its missing end shows it.
+    cut = int(kept * len(lines)) if binary else lines.rindex(b"endfacet", 0, int(kept * len(lines))) + 9
+    path.write_bytes(lines[:cut])
+    with pytest.raises(FileError, match="the STL is truncated"):
+        read_surface(path)
+
+
+_FIRST_MSH = """$NOD
+5
+1 0 0 0
+3 0.1 0 0
+4 0 0.1 0
+7 0 0 0.1
+9 0.1 0.1 0.1
+$ENDNOD
+$ELM
+3
+1 2 0 0 3 1 4 3
+2 4 0 0 4 1 3 4 7
+3 4 0 0 4 3 9 4 7
+$ENDELM
+"""
+
+
+def test_an_msh_of_version_1_is_read_with_its_own_node_numbers(tmp_path: Path) -> None:
+    (tmp_path / "old.msh").write_text(_FIRST_MSH)
+    points, cells = read_volume(tmp_path / "old.msh")
+    assert points.shape == (5, 3) and cells.tolist() == [[0, 1, 2, 3], [1, 4, 2, 3]]
+    (tmp_path / "cut.msh").write_text(_FIRST_MSH[: _FIRST_MSH.index("$ENDELM")])
+    with pytest.raises(FileError, match=r"cut\.msh: could not be read as MSH 1; .* save it as MSH 2 or 4"):
+        read_volume(tmp_path / "cut.msh")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_a_pcd_cloud_is_read_without_its_empty_pixels(encoding: str, tmp_path: Path, ball: Surface) -> None:
+    pypcd4 = pytest.importorskip("pypcd4")
+    points = ball.points.astype(np.float32)
+    points[3] = np.nan
+    fields = np.column_stack([points, np.arange(len(points), dtype=np.float32)])
+    cloud = pypcd4.PointCloud.from_xyzi_points(fields)
+    cloud.save(tmp_path / "cloud.pcd", pypcd4.Encoding(encoding))
+    assert np.array_equal(read_cloud(tmp_path / "cloud.pcd"), np.delete(points, 3, axis=0).astype(float))
+    content = (tmp_path / "cloud.pcd").read_bytes()
+    (tmp_path / "cut.pcd").write_bytes(content[: int(0.7 * len(content))])
+    with pytest.raises(FileError, match="truncated or damaged"):
+        read_cloud(tmp_path / "cut.pcd")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_cloud_of_numbers_that_are_none_is_refused(value: float, tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "cloud.txt", [[0.1, 0.2, 0.3], [0.1, value, 0.3]])
+    with pytest.raises(FileError, match="expected finite coordinates, got NaN or infinity in 1 of 2 points"):
+        read_cloud(tmp_path / "cloud.txt")
+
+
+def test_a_text_cloud_cut_in_the_middle_of_a_number_is_refused(tmp_path: Path, ball: Surface) -> None:
+    for form in ("%.6f", "%.8e"):
+        np.savetxt(tmp_path / "cloud.txt", ball.points, fmt=form)
+        text = (tmp_path / "cloud.txt").read_text()
+        (tmp_path / "cut.txt").write_text(text[:-2])
+        with pytest.raises(FileError, match=r"cut\.txt: .* fewer digits"):
+            read_cloud(tmp_path / "cut.txt")
+        (tmp_path / "whole.txt").write_text(text[:-1])  # an editor that writes no last line end
+        assert len(read_cloud(tmp_path / "whole.txt")) == len(ball.points)
+    (tmp_path / "free.txt").write_text("0 1 .25\n0 1 .5\n0 1 .125\n0 1 1")
+    assert len(read_cloud(tmp_path / "free.txt")) == 4
+
+
+def test_a_frame_is_found_where_the_file_states_it(tmp_path: Path, ball: Surface) -> None:
+    path = _save(tmp_path / "ball.stl", ball, binary=True)
+    assert stated_frame(path) is None
+    content = path.read_bytes()
+    path.write_bytes(b"3D Slicer output. SPACE=RAS".ljust(80) + content[80:])
+    assert stated_frame(path) == "ras" and len(read_surface(path).points) == len(ball.points)
 
 
 def test_unknown_units_and_axes_are_refused(tmp_path: Path, ball: Surface) -> None:

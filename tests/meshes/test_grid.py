@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softtwin.meshes.body import Body, BodyError, Surface
+from softtwin.meshes.checks import compacted
 from softtwin.meshes.grid import SparseGrid, sparse_grid
 from softtwin.meshes.shapes import beam
-from softtwin.meshes.solidify import compacted
 
 EPS = np.finfo(float).eps
 TURN = Rotation.from_euler("xyz", [0.3, 0.5, 0.7]).as_matrix()  # so that nothing lines up with the grid

@@ -105,3 +105,23 @@ def test_the_report_on_the_liver_phantom(liver: Body) -> None:
     assert quality.volume == pytest.approx(liver.volume, rel=len(liver.cells) * np.finfo(float).eps)
     assert 0 < quality.min_radius_ratio < 1 and 0 < quality.min_dihedral < 70.6 < quality.max_dihedral < 180
     assert quality.min_edge < quality.mean_edge < quality.max_edge < 0.05
+
+
+def test_plane_meshes_have_their_own_quality() -> None:
+    """Quadrilaterals were taken for tetrahedra: four corners each."""
+    x, y = np.meshgrid(np.linspace(0, 0.4, 5), np.linspace(0, 0.1, 3), indexing="ij")
+    points, numbers = np.column_stack([x.ravel(), y.ravel()]), np.arange(15).reshape(5, 3)
+    corners = (numbers[:-1, :-1], numbers[1:, :-1], numbers[1:, 1:], numbers[:-1, 1:])
+    squares = np.stack([c.ravel() for c in corners], axis=1)
+    quality = mesh_quality(Body(points, squares, {}))
+    assert (quality.kind, quality.cells) == ("quadrilaterals", 8)
+    assert quality.volume == pytest.approx(0.04, rel=ROUNDING)
+    assert quality.min_scaled_jacobian == pytest.approx(0.05 * 0.1 / (0.05 * 0.1), rel=ROUNDING)
+    assert quality.min_dihedral == pytest.approx(90) and quality.max_dihedral == pytest.approx(90)
+    assert (quality.min_edge, quality.max_edge) == pytest.approx((0.05, 0.1))
+    assert "quadrilaterals" in str(quality) and "area" in str(quality) and "400 cm^2" in str(quality)
+    sheared = Body(points + points[:, 1:] * [0.5, 0], squares, {})
+    assert mesh_quality(sheared).min_dihedral == pytest.approx(np.degrees(np.arctan(2.0)))
+    triangles = Body(points, squares[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), {})
+    assert mesh_quality(triangles).kind == "triangles" and mesh_quality(triangles).volume == pytest.approx(0.04)
+    assert scaled_jacobians(np.array([[0, 0], [1, 0], [0.5, np.sqrt(0.75)]]), np.arange(3)[None]) == pytest.approx([1])

@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.checks import checked_surface
 from softtwin.meshes.embedding import embed
 from softtwin.meshes.metrics import mesh_quality
 from softtwin.meshes.shapes import beam, liver_phantom, propeller
-from softtwin.meshes.solidify import checked_surface
 
 EPS = np.finfo(float).eps
 

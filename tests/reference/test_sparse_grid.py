@@ -8,9 +8,9 @@ import pytest
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.checks import compacted
 from softtwin.meshes.grid import SparseGrid, sparse_grid
 from softtwin.meshes.shapes import beam
-from softtwin.meshes.solidify import compacted
 from softtwin.reference.equilibrium import Problem
 from softtwin.reference.materials import NeoHookean
 

@@ -1,0 +1,127 @@
+"""Tetrahedra by gmsh, for the shapes that the project makes: smooth, closed, without defects."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from .body import Floats, Ints, Surface
+from .checks import SurfaceError, checked_surface
+
+_GMSH_LOCK = threading.RLock()  # gmsh has one global state
+_TETRAHEDRON, _TRIANGLE = 4, 2  # gmsh's element types
+_FEWEST_VERTICES = 30
+_VERTICES_PER_CLUSTER = 10  # of the surface before remeshing, for clusters of even size
+
+
+@contextmanager
+def gmsh_model(name: str) -> Iterator[Any]:
+    """A fresh gmsh model: silent, one thread (so the same input gives the same mesh), gone afterwards.
+
+    Args:
+        name: the model's name.
+
+    Raises:
+        ImportError: gmsh is not installed.
+    """
+    try:
+        import gmsh  # here only: beams and surfaces must work where gmsh is not installed
+    except (ImportError, OSError) as error:
+        raise ImportError(f"gmsh is needed to make tetrahedra and could not be loaded ({error}); "
+                          "install softtwin[mesh].") from error  # fmt: skip
+    with _GMSH_LOCK:
+        # Without interruptible=False gmsh takes over Ctrl-C, which fails outside the main thread.
+        gmsh.initialize(["-nopopup"], readConfigFiles=False, interruptible=False)
+        try:
+            gmsh.option.setNumber("General.Terminal", 0)
+            gmsh.option.setNumber("General.NumThreads", 1)
+            gmsh.option.setNumber("Mesh.RandomSeed", 1)
+            gmsh.model.add(name)
+            yield gmsh
+        finally:
+            gmsh.finalize()
+
+
+def filled(surface: Surface, size: float) -> tuple[Floats, Ints]:
+    """Points (n, 3) in metres and tetrahedra (m, 4) of even size inside a good surface; always the same mesh.
+
+    Args:
+        surface: closed manifold surface, fine enough for cells of this size, metres.
+        size: edge length, metres.
+
+    Raises:
+        SurfaceError: the surface is no such surface, or gmsh could not fill it.
+        ImportError: gmsh or pyacvd is not installed.
+    """
+    surface = _remeshed(checked_surface(surface), size)
+    with gmsh_model("solid") as gmsh:
+        _load(gmsh, surface)
+        faces = [tag for _, tag in gmsh.model.getEntities(2)]
+        gmsh.model.geo.addVolume([gmsh.model.geo.addSurfaceLoop(faces)])
+        gmsh.model.geo.synchronize()
+        try:
+            return fill(gmsh, size)
+        except Exception as error:  # gmsh raises bare Exceptions
+            raise SurfaceError(
+                f"surface: gmsh could not fill it with cells of {size * 1e3:.3g} mm ({error}); try another cell size."
+            ) from error
+
+
+def fill(gmsh: Any, size: float) -> tuple[Floats, Ints]:
+    """Points (n, 3) and tetrahedra (m, 4) of a model's volumes, optimised against slivers by gmsh and Netgen.
+
+    Args:
+        gmsh: the gmsh module with a current model.
+        size: edge length, in the model's unit.
+
+    Raises:
+        ValueError: gmsh made no tetrahedra.
+    """
+    gmsh.option.setNumber("Mesh.MeshSizeMin", size)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+    gmsh.option.setNumber("Mesh.Optimize", 1)
+    gmsh.model.mesh.generate(3)
+    gmsh.model.mesh.optimize("Netgen")
+    tags, coordinates, _ = gmsh.model.mesh.getNodes()
+    _, corners = gmsh.model.mesh.getElementsByType(_TETRAHEDRON)
+    if len(corners) == 0:
+        raise ValueError("gmsh made no tetrahedra")
+    order = np.argsort(tags)
+    cells = order[np.searchsorted(tags, corners, sorter=order)].reshape(-1, 4)
+    used, numbers = np.unique(cells, return_inverse=True)
+    return coordinates.reshape(-1, 3)[used], numbers.reshape(-1, 4).astype(np.int64)
+
+
+def _remeshed(surface: Surface, size: float) -> Surface:
+    # Clustering (ACVD) never hangs; gmsh's own remeshing does, when it cannot flatten a patch with tiny triangles.
+    import pyacvd
+    import pyvista
+
+    count = max(int(surface.area / (size**2 * np.sqrt(3) / 2)), _FEWEST_VERTICES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pyacvd uses a name that pyvista deprecates
+        make: Any = pyvista.PolyData.from_regular_faces  # its stubs refuse float64
+        clusters = pyacvd.Clustering(make(surface.points, surface.triangles))
+        rounds = np.ceil(np.log(_VERTICES_PER_CLUSTER * count / len(surface.points)) / np.log(4))
+        if rounds > 0:
+            clusters.subdivide(int(rounds))
+        clusters.cluster(count)
+        mesh = clusters.create_mesh()
+    try:
+        return checked_surface(Surface(np.asarray(mesh.points, float), np.asarray(mesh.regular_faces)))
+    except SurfaceError as error:
+        raise SurfaceError(
+            f"surface: remeshed with triangles of {size * 1e3:.3g} mm it lost its shape ({error}); "
+            "choose smaller cells."
+        ) from error
+
+
+def _load(gmsh: Any, surface: Surface) -> None:
+    entity = gmsh.model.addDiscreteEntity(2)
+    gmsh.model.mesh.addNodes(2, entity, np.arange(1, len(surface.points) + 1), surface.points.ravel())
+    gmsh.model.mesh.addElementsByType(entity, _TRIANGLE, [], (surface.triangles + 1).ravel())

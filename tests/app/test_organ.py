@@ -1,0 +1,219 @@
+"""The organ that a configuration describes: surfaces as they come, attachment in words, units, frames, what is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+
+pytest.importorskip("pytetwild", reason="the extra mesh is absent")
+
+from softtwin.app import organ as module
+from softtwin.app.cli import main
+from softtwin.app.config import BodySection, parse_config
+from softtwin.app.organ import body_frame, make_organ
+from softtwin.meshes.attachment import RegionError
+from softtwin.meshes.body import Body, BodyError
+from softtwin.meshes.files import FileError, UnitWarning
+from softtwin.meshes.shapes import beam, liver_phantom
+
+PHANTOM_SIZE = 0.016
+
+
+@pytest.fixture(scope="module")
+def phantom() -> Body:
+    return liver_phantom(PHANTOM_SIZE)
+
+
+@pytest.fixture(scope="module")
+def files(phantom: Body, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The phantom's tetrahedra and its inner surfaces as files, millimetres."""
+    folder = tmp_path_factory.mktemp("organ")
+    meshio.Mesh(1e3 * phantom.points, [("tetra", phantom.cells)]).write(folder / "organ.vtu")
+    meshio.Mesh(1e3 * phantom.points, [("triangle", phantom.boundary)]).write(folder / "organ.stl")
+    for name, surface in phantom.inner.items():
+        meshio.Mesh(1e3 * surface.points, [("triangle", surface.triangles)]).write(folder / f"{name}.ply")
+    return folder
+
+
+def section(files: Path, **entries: Any) -> BodySection:
+    base: dict[str, Any] = {"source": "organ.vtu", "unit": "mm", "fixed": "halfspace:60,0,0:1,0,0"}
+    return parse_config({"body": base | entries}).body
+
+
+def make(files: Path, **entries: Any) -> Body:
+    return make_organ(section(files, **entries), files).body
+
+
+def test_a_surface_in_millimetres_becomes_a_body_in_metres_and_says_what_was_done(files: Path, phantom: Body) -> None:
+    made = make_organ(section(files, source="organ.stl", nodes=300), files)
+    assert made.body.volume == pytest.approx(phantom.volume, rel=0.02)
+    assert made.body.points[made.body.fixed, 0].min() > 0.06
+    assert any("volume before" in note for note in made.notes) and any("moved at most" in note for note in made.notes)
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "near:vessel_hepatic:20mm",
+        "ball:8,18,-20:24",
+        "ball:0.8,1.8,-2.0cm:24mm",
+        "box:-200,-200,-200:200,200,-35",
+        "halfspace:0,0,-35:0,0,-1",
+        "ball:8,18,-20:24 + halfspace:60,0,0:1,0,0",
+    ],
+)
+def test_what_holds_the_organ_can_be_said_in_words(files: Path, phantom: Body, where: str) -> None:
+    body = make(files, fixed=where, inner={"vessel_hepatic": "vessel_hepatic.ply"})
+    assert 3 <= len(body.fixed) < 0.3 * len(body.points)
+    assert np.isin(body.fixed, body.boundary_nodes).all()
+
+
+def test_a_union_holds_both_parts(files: Path) -> None:
+    one, two = "ball:8,18,-20:24", "halfspace:60,0,0:1,0,0"
+    parts = [make(files, fixed=where).fixed for where in (one, two)]
+    assert np.array_equal(make(files, fixed=f"{one} + {two}").fixed, np.union1d(*parts))
+
+
+def test_zones_and_the_observed_side_take_the_same_words_and_not_the_distance_of_fixed(files: Path) -> None:
+    words = {"zones": {"tool": "ball:-60,-60,0:30"}, "observed": "seen-from:-60,-500,50"}
+    body = make(files, **words)
+    assert len(body.node_sets["tool"]) > 3
+    towards = np.array([-0.06, -0.5, 0.05]) - body.points[body.surfaces["observed"]].mean(axis=1)
+    a, b, c = (body.points[body.surfaces["observed"][:, i]] for i in range(3))
+    assert (np.einsum("ti,ti->t", np.cross(b - a, c - a), towards) > 0).all()
+    wide = make(files, **words, fixed_distance=0.03)
+    assert np.array_equal(wide.node_sets["tool"], body.node_sets["tool"])
+    assert np.array_equal(wide.surfaces["observed"], body.surfaces["observed"])
+    file = {"zones": {"tool": "tumour.ply"}, "inner": {}}
+    assert np.array_equal(
+        make(files, **file, fixed_distance=0.06).node_sets["tool"], make(files, **file).node_sets["tool"]
+    )
+
+
+def test_a_missing_attachment_is_said_before_anything_is_meshed(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "solidify", lambda *_, **__: pytest.fail("it was meshed"))
+    for entries, error, message in (
+        ({"fixed": ""}, BodyError, "Give --fixed FILE"),
+        ({"fixed": "veins.ply"}, FileError, "no such file"),
+        ({"fixed": "near:veins:5mm"}, RegionError, r"one of \['tumour'\], got 'veins'"),
+        ({"fixed": "ball:1,2:3"}, RegionError, "expected three numbers for its centre"),
+        ({"zones": {"tool": "box:1,2,3"}}, RegionError, "expected box:X,Y,Z:X,Y,Z"),
+    ):
+        with pytest.raises(error, match=message):
+            make(files, **{"source": "organ.stl", "inner": {"tumour": "tumour.ply"}} | entries)
+
+
+def test_a_unit_can_stand_behind_a_file(files: Path, tmp_path: Path) -> None:
+    points = np.loadtxt(_veins(files, tmp_path, 1e2))
+    assert np.ptp(points) < 25
+    fixed = make(files, fixed=f"{tmp_path / 'veins.txt'}:cm").fixed
+    assert np.array_equal(fixed, make(files, fixed=str(_veins(files, tmp_path, 1e3))).fixed)
+
+
+def _veins(files: Path, folder: Path, scale: float, turn: bool = False) -> Path:
+    body = make(files)
+    np.savetxt(folder / "veins.txt", scale * body.points[body.fixed] * ([-1, -1, 1] if turn else [1, 1, 1]))
+    return folder / "veins.txt"
+
+
+@pytest.mark.parametrize(
+    ("source", "frame", "veins"),
+    [("organ.vtu:lps", "", ":ras"), ("organ.vtu", "ras", ":lps"), ("organ.vtu:ras", "lps", "")],
+)
+def test_a_file_in_the_other_frame_is_turned(files: Path, tmp_path: Path, source: str, frame: str, veins: str) -> None:
+    path = _veins(files, tmp_path, 1e3, turn=True)
+    body = make(files, source=source, frame=frame, fixed=f"{path}{veins}", fixed_distance=1e-4)
+    assert np.array_equal(body.fixed, make(files).fixed) and np.array_equal(body.points, make(files).points)
+
+
+def test_a_frame_that_a_file_states_counts(files: Path, tmp_path: Path, phantom: Body) -> None:
+    meshio.Mesh(1e3 * phantom.points, [("triangle", phantom.boundary)]).write(tmp_path / "organ.ply", binary=False)
+    text = (tmp_path / "organ.ply").read_text()
+    (tmp_path / "organ.ply").write_text(
+        text.replace("ply\n", "ply\n", 1).replace("element", "comment SPACE=RAS\nelement", 1)
+    )
+    entries = section(files, source=str(tmp_path / "organ.ply"))
+    assert body_frame(entries, files) == "ras"
+    assert body_frame(section(files), files) is None and body_frame(section(files, frame="lps"), files) == "lps"
+
+
+def test_an_inner_surface_outside_the_organ_is_refused_and_a_part_outside_is_said(files: Path, tmp_path: Path) -> None:
+    tumour = meshio.read(files / "tumour.ply")
+    for shift, name in ((300.0, "far"), (-22.0, "partly")):
+        tumour_points = tumour.points + np.array([shift, 0.0, 0.0])
+        meshio.Mesh(tumour_points, tumour.cells).write(tmp_path / f"{name}.ply")
+    with pytest.raises(BodyError, match=r"body\.inner\.tumour: .* 100 % of its vertices outside, up to \d+"):
+        make(files, inner={"tumour": str(tmp_path / "far.ply")})
+    notes = make_organ(section(files, inner={"tumour": str(tmp_path / "partly.ply")}), files).notes
+    assert any(note.startswith("warning: tumour: ") and " mm" in note for note in notes), notes
+
+
+@pytest.mark.filterwarnings("ignore::softtwin.meshes.files.UnitWarning")
+@pytest.mark.parametrize("entries", [{"nodes": 300}, {"cell_size": 0.01}])
+def test_millimetres_read_as_metres_are_refused_at_once(
+    files: Path, monkeypatch: pytest.MonkeyPatch, entries: dict[str, Any]
+) -> None:
+    monkeypatch.setattr(module, "solidify", lambda *_, **__: pytest.fail("it was meshed"))
+    with pytest.raises(FileError, match=r"expected an organ of 5 mm to 2 m, got \d+ m across when read in m; .*--unit"):
+        make(files, source="organ.stl", unit="m", **entries)
+
+
+def test_an_observed_side_that_winds_inward_is_turned_and_counted_once(files: Path, tmp_path: Path) -> None:
+    body = make(files)
+    inward = body.boundary[:40, ::-1]
+    np.save(tmp_path / "seen.npy", np.concatenate([inward, inward]))
+    made = make_organ(section(files, observed=str(tmp_path / "seen.npy")), files)
+    assert np.array_equal(made.body.surfaces["observed"], body.boundary[:40])
+    assert any("80 of 80 triangles wound inward" in note for note in made.notes)
+
+
+def test_triangles_that_are_no_boundary_are_refused(files: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "seen.npy", make(files).cells[:3, :3])
+    with pytest.raises(BodyError, match=r"triangles of the body's boundary, got \d of 3 that are not"):
+        make(files, observed=str(tmp_path / "seen.npy"))
+
+
+def test_node_numbers_still_work(files: Path, tmp_path: Path) -> None:
+    fixed = make(files).fixed
+    np.save(tmp_path / "fixed.npy", fixed)
+    np.savetxt(tmp_path / "fixed.txt", fixed, fmt="%d")
+    for name in ("fixed.npy", "fixed.txt"):
+        assert np.array_equal(make(files, fixed=str(tmp_path / name)).fixed, fixed)
+
+
+def test_lone_listed_nodes_are_not_an_attachment() -> None:
+    """An attachment is a surface: a listed node without a whole listed triangle is left free."""
+    bare = beam((6, 2, 2), (0.6, 0.2, 0.2), "tetrahedron")
+    lone = int(bare.node_sets["tip"][0])
+    assert np.array_equal(module._attached(bare, np.append(bare.fixed, lone)), bare.fixed)
+
+
+def test_mesh_prints_and_keeps_what_was_done(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from softtwin.app.config import Config, to_toml
+
+    body = section(files, source=str(files / "organ.stl"), nodes=200)
+    (tmp_path / "organ.toml").write_text(to_toml(Config(folder="out", body=body)))
+    main(["mesh", str(tmp_path / "organ.toml")])
+    said = capsys.readouterr().out
+    assert "surface: moved at most" in said and "scaled Jacobian" in said
+    assert "surface: moved at most" in (tmp_path / "out" / "mesh_quality.txt").read_text()
+
+
+def test_the_phantom_takes_an_attachment_in_words() -> None:
+    made = make_organ(BodySection(source="liver-phantom", cell_size=PHANTOM_SIZE, fixed="near:tumour:40mm"), Path("."))
+    own = liver_phantom(PHANTOM_SIZE)
+    assert made.body.inner.keys() == own.inner.keys() and not np.array_equal(made.body.fixed, own.fixed)
+    assert replace(made, notes=()).notes == ()
+
+
+def test_unit_warnings_stay_for_clouds(tmp_path: Path) -> None:
+    from softtwin.meshes.files import read_cloud
+
+    np.save(tmp_path / "cloud.npy", 100 * np.eye(3))
+    with pytest.warns(UnitWarning, match="--unit mm"):
+        read_cloud(tmp_path / "cloud.npy")
