@@ -95,10 +95,11 @@ def linearised(
         consistency: of the loss that gave the weights.
     """
     data = jacobian @ coefficients - residuals
-    weighted = weights[:, None] * jacobian
+    weighted: Floats = weights[:, None] * jacobian
     values, vectors = np.linalg.eigh(jacobian.T @ weighted)
     values = np.maximum(np.asarray(values, dtype=np.float64), 0.0)
-    projections: Floats = vectors.T @ (weighted.T @ data)
+    pulled: Floats = weighted.T @ data
+    projections = vectors.T @ pulled
     seen = values > _SEEN * values.max(initial=0.0)
     explained = float((projections[seen] ** 2 / values[seen]).sum())
     rest = max(float(data @ (weights * data)) - explained, 0.0) / consistency

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from softtwin.meshes.files import Axes, FileError, Unit
+from softtwin.meshes.files import FileError, Frame, Unit
 
 Floats = NDArray[np.float64]
 
@@ -247,7 +247,7 @@ def _itk_matrix(path: Path) -> Any:
     return matrix
 
 
-def read_landmarks(path: str | Path, unit: Unit = "m", frame: Axes | None = None) -> dict[str, Floats]:
+def read_landmarks(path: str | Path, unit: Unit = "m", frame: Frame | None = None) -> dict[str, Floats]:
     """Named points of a file, each (3,), metres.
 
     Args:
@@ -291,7 +291,7 @@ def _named_rows(path: Path) -> _Named:
     return [(row[0], row[1:]) for row in rows]
 
 
-def _fiducials(path: Path) -> tuple[_Named, Axes]:
+def _fiducials(path: Path) -> tuple[_Named, Frame]:
     said = "0"
     columns = ["id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label"]
     rows = []
@@ -306,7 +306,7 @@ def _fiducials(path: Path) -> tuple[_Named, Axes]:
     return named, _axes(path, {"0": "RAS", "1": "LPS"}.get(said, said))
 
 
-def _markup_points(path: Path) -> tuple[_Named, Axes, Unit]:
+def _markup_points(path: Path) -> tuple[_Named, Frame, Unit]:
     markup = json.loads(path.read_text())["markups"][0]
     points = [point for point in markup["controlPoints"] if point.get("positionStatus", "defined") == "defined"]
     units = markup.get("coordinateUnits", "mm")
@@ -320,7 +320,7 @@ def _unit(path: Path, said: str) -> Unit:
     raise FileError(f"{path}: expected points in m, cm or mm, got {said!r}.")
 
 
-def _axes(path: Path, said: str) -> Axes:
+def _axes(path: Path, said: str) -> Frame:
     if said.upper() == "LPS":
         return "lps"
     if said.upper() == "RAS":
