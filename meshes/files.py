@@ -46,6 +46,10 @@ class FileError(ValueError):
     """A file that cannot be used: the message names it, what was expected and what came."""
 
 
+class ContentError(FileError):
+    """A file that is there and was read, but holds no points, or numbers that are not finite."""
+
+
 class UnitWarning(UserWarning):
     """A file whose size fits no organ: it was probably read in the wrong unit."""
 
@@ -128,7 +132,7 @@ def read_cloud(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Floats
     if points.ndim != 2 or points.shape[1] != 3:
         raise FileError(f"{path}: expected a cloud of shape (p, 3), got {points.shape}.")
     if len(points) == 0:
-        raise FileError(f"{path}: expected a cloud with points, got none.")
+        raise ContentError(f"{path}: expected a cloud with points, got none.")
     return _in_metres(path, points, unit, axes, smallest=0.0)
 
 
@@ -243,7 +247,7 @@ def _existing(path: str | Path) -> Path:
     if not path.is_file():
         raise FileError(f"{path}: no such file." if not path.exists() else f"{path}: expected a file, got a folder.")
     if path.stat().st_size == 0:
-        raise FileError(f"{path}: the file is empty.")
+        raise ContentError(f"{path}: the file is empty.")
     return path
 
 
@@ -258,9 +262,9 @@ def _read(path: str | Path) -> _Mesh:
         known = ", ".join((*_MESHIO, *_VTK))
         raise FileError(f"{path}: expected a mesh file ({known}), got suffix {suffix!r}.")
     if len(mesh.points) == 0:
-        raise FileError(f"{path}: the file holds no points; it may be truncated or damaged.")
+        raise ContentError(f"{path}: the file holds no points; it may be truncated or damaged.")
     if not np.isfinite(mesh.points).all():
-        raise FileError(f"{path}: expected finite coordinates, got NaN or infinity.")
+        raise ContentError(f"{path}: expected finite coordinates, got NaN or infinity.")
     for name, block in mesh.cells.items():
         if block.min(initial=0) < 0 or block.max(initial=0) >= len(mesh.points):
             raise FileError(f"{path}: a {name} refers to a point that is not there; the file may be damaged.")
