@@ -8,17 +8,21 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from softtwin.meshes.body import Body, Surface
-from softtwin.meshes.export import SURFACE_FORMATS, write_series, write_surface
+from softtwin.meshes.export import SURFACE_FORMATS, write_points, write_series, write_surface
 from softtwin.meshes.files import write_deformed
 from softtwin.registration.registrar import Registration
 
 from .twin import Twin
 
+Floats = NDArray[np.float64]
 FORMATS = ("vtu", *SURFACE_FORMATS)
 WRITTEN = ("vtu", "vtp")  # where nothing else is asked for
 SERIES = "frames.pvd"
-VOLUME = "frame"
+VOLUME, CLOUD = "frame", "cloud"
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,14 @@ class Exporter:
     def _names(self) -> Mapping[str, str]:
         return file_names(self.twin.body.inner)
 
-    def write(self, number: int, result: Registration) -> list[str]:
-        """Names of the files written for a frame, each whole or not at all."""
+    def write(self, number: int, result: Registration, cloud: Floats | None = None) -> list[str]:
+        """Names of the files written for a frame, each whole or not at all.
+
+        Args:
+            number: of the frame.
+            result: what was found.
+            cloud: the cloud, thinned, (p, 3), metres; written beside the surfaces, in the body's coordinates.
+        """
         names, place = [], self.twin.coordinates
         moved = place.lengths(result.displacement)
         if "vtu" in self.formats:
@@ -68,6 +78,9 @@ class Exporter:
             for kind in kinds:
                 names.append(f"{self._names.get(name, 'organ')}_{number:04d}.{kind}")
                 write_surface(self.folder / names[-1], outward, shift)
+        if cloud is not None and "vtp" in kinds:
+            names.append(f"{CLOUD}_{number:04d}.vtp")
+            write_points(self.folder / names[-1], place.lengths(result.pose.inverse().apply(cloud)))
         return names
 
     def write_series(self, frames: Iterable[tuple[int, Sequence[str]]]) -> str:
@@ -85,8 +98,8 @@ class Exporter:
 
 
 def file_names(structures: Iterable[str]) -> dict[str, str]:
-    """For each inner structure a name that a file may bear, no two alike, none that of the organ or the whole frame."""
-    taken, named = {"organ", VOLUME}, {}
+    """For each inner structure a name that a file may bear: no two alike, and none of those that frames use."""
+    taken, named = {"organ", VOLUME, CLOUD}, {}
     for structure in structures:
         plain = re.sub(r"[^\w.-]+", "_", structure).strip("._") or "inner"
         name, count = plain, 2

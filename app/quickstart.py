@@ -131,7 +131,7 @@ def _registered(twin: Twin, zone: str, cloud: Floats, truth: Floats, folder: Pat
     """The cloud registered and written as any user's is."""
     result = twin.register(cloud, zone)
     with Recorder(Exporter(twin, folder), zone, twin.body.points + truth[None]) as recorder:
-        recorder.add(Frame(0, result.judgement, result, result.seconds))
+        recorder.add(Frame(0, result.judgement, result, result.seconds, cloud))
     return result
 
 

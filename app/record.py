@@ -64,15 +64,16 @@ class Recorder:
         if frame.registration is not None:
             truth = None if self.truth is None else self.truth[frame.number]
             row |= frame_figures(self.exporter.twin, frame.registration, truth)
-            row["files"] = self.exporter.write(frame.number, frame.registration)
+            row["files"] = self.exporter.write(frame.number, frame.registration, frame.cloud)
         self.rows.append(row)
         if time.monotonic() - self._written > _EVERY:
             self.write()
         return row
 
     def write(self) -> None:
-        """Write the record and the time series as they are now, each whole or not at all."""
-        series = self.exporter.write_series((row["frame"], row["files"]) for row in self.rows)
+        """Write the record, and the time series of the frames not refused, each whole or not at all."""
+        usable = (row for row in self.rows if row["verdict"] != Verdict.REFUSED.value)
+        series = self.exporter.write_series((row["frame"], row["files"]) for row in usable)
         content = {**self.header, "counts": counts(self.rows), "series": series, "frames": self.rows}
         path = self.exporter.folder / RECORD
         partial = path.with_name(f".{RECORD}.partial")
@@ -162,6 +163,7 @@ def describe(row: Mapping[str, Any]) -> str:
         line += f", error {millimetres(row['error']['mean'])}"
     for name, target in row["targets"].items():
         line += f", {name} moved {millimetres(target['movement_m'], 1)}"
+        line += f" ({millimetres(target['error_m'])} off)" if "error_m" in target else ""
     return line
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -28,6 +28,7 @@ from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registrar, Registration, RegistrationOptions
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.rigid import align
+from softtwin.registration.thinning import thinned
 from softtwin.registration.unknowns import Forces, Informed, PosePrior, informed, nodal_forces
 from softtwin.registration.verdict import Judgement, Verdict
 
@@ -54,12 +55,14 @@ class Frame:
         judgement: whether the result can be used, and why not.
         registration: what was found; None where the cloud cannot be registered at all.
         seconds: wall time, that of a search for the pose included.
+        cloud: points that were used, after thinning, (p, 3), metres; None as above.
     """
 
     number: int
     judgement: Judgement
     registration: Registration | None
     seconds: float
+    cloud: Floats | None = None
 
 
 class Twin:
@@ -261,12 +264,26 @@ class Sequence:
         try:
             if self.camera == "align":
                 self.camera = self.twin.aligned(cloud)
-            result = self.twin.register(cloud, self.zone, self._last, self.camera)
+            result = self._registered(cloud)
         except (CloudError, NotConverged) as error:
             return self.refuse(str(error), time.perf_counter() - begin)
         if result.judgement.is_usable:
             self._last = result
-        return Frame(self._next(), result.judgement, result, time.perf_counter() - begin)
+        seconds = time.perf_counter() - begin
+        points = np.asarray(cloud, dtype=np.float64)
+        used = points[thinned(points, self.twin.config.registration.points)]
+        return Frame(self._next(), result.judgement, result, seconds, used)
+
+    def _registered(self, cloud: ArrayLike) -> Registration:
+        """From the last frame; what is not accepted is tried from rest too, lest one bad frame spoil those after it."""
+        warm = None
+        if self._last is not None:
+            with suppress(NotConverged):
+                warm = self.twin.register(cloud, self.zone, self._last, self.camera)
+            if warm is not None and warm.judgement.verdict is Verdict.ACCEPTED:
+                return warm
+        cold = self.twin.register(cloud, self.zone, None, self.camera)
+        return cold if warm is None else min(warm, cold, key=_badness)
 
     def refuse(self, reason: str, seconds: float = 0.0) -> Frame:
         """The next frame without a result: its cloud cannot be used.
@@ -280,6 +297,10 @@ class Sequence:
     def _next(self) -> int:
         self._count += 1
         return self._count - 1
+
+
+def _badness(result: Registration) -> tuple[int, float]:
+    return list(Verdict).index(result.judgement.verdict), result.noise
 
 
 def _unknown_forces(model: ForwardModel, observed: SurfaceDistance, zone: str, config: Config) -> Forces:

@@ -18,7 +18,7 @@ from vtkmodules.vtkIOGeometry import vtkSTLWriter
 from vtkmodules.vtkIOPLY import vtkPLYWriter
 from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-from .body import Floats, Surface
+from .body import Floats, Ints, Surface
 from .files import Axes, FileError, Unit
 
 SURFACE_FORMATS = ("stl", "ply", "vtp")
@@ -73,41 +73,68 @@ def write_surface(path: str | Path, surface: Surface, fields: Mapping[str, Array
     Raises:
         FileError: another suffix, or the file could not be written.
     """
+    used, local = np.unique(surface.triangles, return_inverse=True)
+    chosen = {name: np.asarray(field)[used] for name, field in (fields or {}).items()}
+    _write(Path(path), _polygons(surface.points[used], local.reshape(-1, 3), chosen))
+
+
+def write_points(path: str | Path, points: ArrayLike, fields: Mapping[str, ArrayLike] | None = None) -> None:
+    """Write a cloud of points, (p, 3); otherwise as `write_surface`, of which STL knows no points.
+
+    Args:
+        path: file to write: `.ply` or `.vtp`.
+        points: (p, 3), in the coordinates that are to be written.
+        fields: arrays with a row for each point, by name; VTP alone keeps them.
+
+    Raises:
+        FileError: another suffix, or the file could not be written.
+    """
+    positions = np.asarray(points, dtype=np.float64)
     path = Path(path)
+    if path.suffix.lower() == ".stl":
+        raise FileError(f"{path}: expected the suffix .ply or .vtp, got '.stl': it holds triangles alone.")
+    _write(path, _polygons(positions, np.arange(len(positions))[:, None], fields or {}))
+
+
+def _polygons(points: Floats, cells: Ints, fields: Mapping[str, ArrayLike]) -> vtkPolyData:
+    """Triangles, (t, 3), or single points, (p, 1)."""
+    data, places, array = vtkPolyData(), vtkPoints(), vtkCellArray()
+    places.SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=True))
+    offsets = np.arange(0, cells.size + 1, cells.shape[1])
+    numbers = cells.ravel().astype(np.int64)
+    array.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(numbers, deep=True))
+    data.SetPoints(places)
+    if cells.shape[1] == 1:
+        data.SetVerts(array)
+    else:
+        data.SetPolys(array)
+    for name, field in fields.items():
+        values = numpy_to_vtk(np.ascontiguousarray(field), deep=True)
+        values.SetName(name)
+        data.GetPointData().AddArray(values)
+    return data
+
+
+def _write(path: Path, data: vtkPolyData) -> None:
     suffix = path.suffix.lower()
     writers: Mapping[str, Any] = {".stl": vtkSTLWriter, ".ply": vtkPLYWriter, ".vtp": vtkXMLPolyDataWriter}
     if suffix not in writers:
         raise FileError(f"{path}: expected the suffix {', '.join(writers)}, got {path.suffix!r}.")
-    partial = path.with_name(f".{path.name}.partial")
+    partial = path.with_name(f".partial.{path.name}")  # VTK's PLY writer adds a suffix to any name without its own
     writer = writers[suffix]()
     writer.SetFileName(str(partial))
-    writer.SetInputData(_polygons(surface, fields or {} if suffix == ".vtp" else {}))
     if suffix == ".vtp":
         writer.SetDataModeToAppended()
         writer.EncodeAppendedDataOff()
     else:
         writer.SetFileTypeToBinary()
+        for name in [data.GetPointData().GetArrayName(i) for i in range(data.GetPointData().GetNumberOfArrays())]:
+            data.GetPointData().RemoveArray(name)
+    writer.SetInputData(data)
     if not path.parent.is_dir() or not writer.Write() or not partial.is_file():
         partial.unlink(missing_ok=True)
         raise FileError(f"{path}: could not be written; is the folder there, and is the disk full?")
     os.replace(partial, path)
-
-
-def _polygons(surface: Surface, fields: Mapping[str, ArrayLike]) -> vtkPolyData:
-    used, local = np.unique(surface.triangles, return_inverse=True)
-    data, points, cells = vtkPolyData(), vtkPoints(), vtkCellArray()
-    points.SetData(numpy_to_vtk(np.ascontiguousarray(surface.points[used]), deep=True))
-    offsets = np.arange(0, surface.triangles.size + 1, 3)
-    cells.SetData(
-        numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(local.ravel().astype(np.int64), deep=True)
-    )
-    data.SetPoints(points)
-    data.SetPolys(cells)
-    for name, field in fields.items():
-        array = numpy_to_vtk(np.ascontiguousarray(np.asarray(field)[used]), deep=True)
-        array.SetName(name)
-        data.GetPointData().AddArray(array)
-    return data
 
 
 def write_series(path: str | Path, files: Iterable[tuple[float, str, str]]) -> None:
