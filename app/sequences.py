@@ -111,8 +111,9 @@ def _pictures(
     if not drawn:
         return []
     worst = max(drawn, key=lambda row: (_WORST.index(row["verdict"]), row["noise_m"] or np.inf))
-    names = {drawn[0]["frame"]: "first", drawn[-1]["frame"]: "last"}
-    names.setdefault(worst["frame"], "worst")
+    names = {worst["frame"]: "worst", drawn[-1]["frame"]: "last", drawn[0]["frame"]: "first"}
+    if len(drawn) == 1:
+        names = {drawn[0]["frame"]: "only"}
     chosen = [row for row in drawn if row["frame"] in names]
     states = [_displacement(folder / _file(row, "frame", "vtu"), body, place) for row in chosen]
     clouds = [_cloud(folder, row, place) for row in chosen]

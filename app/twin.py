@@ -78,7 +78,8 @@ class Twin:
     """
 
     def __init__(self, model: ForwardModel, config: Config | None = None, resources: ExitStack | None = None) -> None:
-        self.model, self.config = model, config or Config()
+        self._model: ForwardModel | None = model
+        self.config = config or Config()
         self._resources = resources or ExitStack()
         self._forces: dict[str, Forces] = {}
         self._registrars: dict[str, Registrar] = {}
@@ -100,7 +101,10 @@ class Twin:
         return find_twin(folder).twin(model, **options)
 
     def close(self) -> None:
-        """Give back what the model holds; the twin is of no use afterwards."""
+        """Give back what the model holds; the twin is of no use afterwards, nor are derivatives of its states."""
+        self._model = None  # FEniCSx ends the process that uses what was given back
+        self._registrars.clear()
+        self._posed = None
         self._resources.close()
 
     def __enter__(self) -> Twin:
@@ -108,6 +112,17 @@ class Twin:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    @property
+    def model(self) -> ForwardModel:
+        """The forward model.
+
+        Raises:
+            RuntimeError: the twin has been closed.
+        """
+        if self._model is None:
+            raise RuntimeError("twin: expected an open twin, got one that was closed; open it again.")
+        return self._model
 
     @property
     def body(self) -> Body:
