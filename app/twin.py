@@ -79,6 +79,7 @@ class Twin:
 
     def __init__(self, model: ForwardModel, config: Config | None = None, resources: ExitStack | None = None) -> None:
         self._model: ForwardModel | None = model
+        self._body = model.body
         self.config = config or Config()
         self._resources = resources or ExitStack()
         self._forces: dict[str, Forces] = {}
@@ -127,7 +128,7 @@ class Twin:
     @property
     def body(self) -> Body:
         """The body at rest, metres."""
-        return self.model.body
+        return self._body
 
     @property
     def coordinates(self) -> Coordinates:

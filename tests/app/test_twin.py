@@ -176,3 +176,14 @@ def test_a_closed_twin_says_so(mesh_folder: Path) -> None:
     for use in (lambda: twin.predict(rest), lambda: twin.register(rest)):
         with pytest.raises(RuntimeError, match="closed"):
             use()
+    assert len(twin.body.points) == len(rest)
+
+
+def test_the_five_lines_of_the_guide_run(small_quickstart: Path, capsys) -> None:
+    guide = (Path(__file__).parents[2] / "docs" / "registration.md").read_text()
+    lines = guide.split("```python\n")[1].split("```")[0].replace("liver/twin", str(small_quickstart / "twin"))
+    assert len([line for line in lines.splitlines() if line.strip()]) <= 5
+    found = {"cloud": np.load(small_quickstart / "demo" / "cloud.npy")}
+    exec(lines, found)
+    assert capsys.readouterr().out.startswith("accepted")
+    assert found["result"].judgement.verdict is Verdict.ACCEPTED
