@@ -24,7 +24,7 @@ from .twin import Frame, Twin
 Floats = NDArray[np.float64]
 NOTICE = "Research software: not a medical device."
 RECORD = "registration.json"
-_EVERY = 1.0  # seconds between two writings: the record of a long sequence is large
+_EVERY, _SHARE = 1.0, 0.05  # at least so many seconds between two writings, and at most this share of the time on them
 
 
 class Recorder:
@@ -42,7 +42,7 @@ class Recorder:
         self.exporter, self.truth = exporter, truth
         self.rows: list[dict[str, Any]] = []
         self.header = _header(exporter.twin, zone)
-        self._written = -math.inf
+        self._due = -math.inf
         exporter.folder.mkdir(parents=True, exist_ok=True)
         remove_record(exporter.folder)
 
@@ -66,12 +66,13 @@ class Recorder:
             row |= frame_figures(self.exporter.twin, frame.registration, truth)
             row["files"] = self.exporter.write(frame.number, frame.registration, frame.cloud)
         self.rows.append(row)
-        if time.monotonic() - self._written > _EVERY:
+        if time.monotonic() > self._due:
             self.write()
         return row
 
     def write(self) -> None:
         """Write the record, and the time series of the frames not refused, each whole or not at all."""
+        begin = time.monotonic()
         usable = (row for row in self.rows if row["verdict"] != Verdict.REFUSED.value)
         series = self.exporter.write_series((row["frame"], row["files"]) for row in usable)
         content = {**self.header, "counts": counts(self.rows), "series": series, "frames": self.rows}
@@ -79,7 +80,8 @@ class Recorder:
         partial = path.with_name(f".{RECORD}.partial")
         partial.write_text(json.dumps(finite(content), indent=1, allow_nan=False) + "\n")
         os.replace(partial, path)
-        self._written = time.monotonic()
+        now = time.monotonic()
+        self._due = now + max(_EVERY, (now - begin) / _SHARE)
 
 
 def _header(twin: Twin, zone: str | None) -> dict[str, Any]:

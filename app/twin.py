@@ -277,18 +277,23 @@ class Sequence:
     def register(self, cloud: ArrayLike) -> Frame:
         """The next frame; refused, with the reason, where the cloud cannot be registered."""
         begin = time.perf_counter()
+        points = self._thinned(cloud)
         try:
             if self.camera == "align":
-                self.camera = self.twin.aligned(cloud)
-            result = self._registered(cloud)
+                self.camera = self.twin.aligned(points)
+            result = self._registered(points)
         except (CloudError, NotConverged) as error:
             return self.refuse(str(error), time.perf_counter() - begin)
         if result.judgement.is_usable:
             self._last = result
-        seconds = time.perf_counter() - begin
+        return Frame(self._next(), result.judgement, result, time.perf_counter() - begin, points)
+
+    def _thinned(self, cloud: ArrayLike) -> Floats:
+        """Once for all that is tried with it; what is no cloud is left for the registrar to refuse."""
         points = np.asarray(cloud, dtype=np.float64)
-        used = points[thinned(points, self.twin.config.registration.points)]
-        return Frame(self._next(), result.judgement, result, seconds, used)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            return points
+        return points[thinned(points, self.twin.config.registration.points)]
 
     def _registered(self, cloud: ArrayLike) -> Registration:
         """From the last frame; what is not accepted is tried from rest too, lest one bad frame spoil those after it."""
