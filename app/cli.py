@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import sys
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 from threadpoolctl import threadpool_limits
 
-from softtwin.meshes.files import Unit, UnitWarning
+from softtwin.meshes.files import Unit
+from softtwin.reference.ranks import FailedElsewhere
 
 from .config import LAWS, Config, ConfigError, parse_config, to_toml
 from .register import NOTICE
 
+# What libraries tell those who write programs with them.
+_FOR_DEVELOPERS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning, ImportWarning, ResourceWarning)
 _PATH = click.Path(path_type=Path)
 _EXISTING = click.Path(exists=True, path_type=Path)
 
@@ -65,17 +67,18 @@ def mesh(configuration: Path) -> None:
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
 @click.option("--redo", multiple=True, type=int, help="Make this block again (may be repeated).")
-def generate(configuration: Path, redo: tuple[int, ...]) -> None:
-    """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped."""
-    from .chain import describe_data
-    from .stages.generate import generate_stage
-    from .workspace import open_workspace
+@click.option("--again", is_flag=True, help="Throw a data set that is there away, and make it anew.")
+def generate(configuration: Path, redo: tuple[int, ...], again: bool) -> None:
+    """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped.
 
-    space = open_workspace(configuration)
-    data = generate_stage(space, redo)
+    Blocks that are damaged are found and made again. Another body or configuration is refused.
+    """
+    from .stages.generate import describe_data, generate_stage
+
+    data = generate_stage(configuration, redo, again)
     if data is not None:
         click.echo(describe_data(data))
-        click.echo(f"written to {space.data}")
+        click.echo(f"written to {data.path}")
 
 
 @softtwin.command()
@@ -87,9 +90,7 @@ def train(configuration: Path, fresh: bool) -> None:
     from .workspace import open_workspace
 
     space = open_workspace(configuration)
-    if fresh and space.training.exists():
-        shutil.rmtree(space.training)
-    train_stage(space)
+    train_stage(space, fresh)
     click.echo(f"twin written to {space.twin}")
 
 
@@ -216,15 +217,22 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 @click.option(
     "--path", type=int, default=1, show_default=True, help="Draws that share a load at growing sizes (cheaper)."
 )
-@click.option("--seconds", type=float, default=120.0, show_default=True, help="Time to train.")
+@click.option(
+    "--seconds", type=float, default=120.0, show_default=True, help="Wall time to train; ends with the step under way."
+)
 @click.option("--ranks", type=int, default=0, help="MPI ranks; 0: one a core.")
 @click.option(
     "--output", type=_PATH, default=Path("twin-run"), show_default=True, help="Folder of everything that is made."
 )
-def build(surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, **given: Any) -> None:
+@click.option("--again", is_flag=True, help="Throw equilibria that were solved in OUTPUT before away.")
+def build(
+    surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, again: bool, **given: Any
+) -> None:
     """Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH): mesh, equilibria, surrogate, held-out errors.
 
-    Writes OUTPUT/organ.toml with all settings; run again after an interruption, it goes on where it stopped.
+    Writes OUTPUT/organ.toml with all settings; run again after an interruption, it goes on where it stopped. With
+    other options or changed files it makes again what depends on them; only equilibria that were solved are never
+    thrown away unasked.
     """
     from .chain import build_twin
 
@@ -250,7 +258,7 @@ def build(surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...],
         },
         "training": {"seconds": given["seconds"]},
     }
-    build_twin(parse_config(entries, "command line"), output, click.echo)
+    build_twin(parse_config(entries, "command line"), output, click.echo, again)
 
 
 def _named_files(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:
@@ -283,34 +291,62 @@ def quickstart(output: Path, small: bool) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors of the input are one message and exit code 2, not a traceback."""
-    warnings.showwarning = _show_warning
     # Ranks are the parallelism: on meshes of an organ's size several BLAS threads in one process only wait for another.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Threads that spin while they wait made training 14 times slower on two cores that others used as well.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
-        with threadpool_limits(int(os.environ["OPENBLAS_NUM_THREADS"]), "blas"):
+        with warnings.catch_warnings(), threadpool_limits(int(os.environ["OPENBLAS_NUM_THREADS"]), "blas"):
+            warnings.showwarning = _show_warning
             softtwin.main(args=arguments, standalone_mode=False)
     except click.ClickException as error:
-        error.show()
+        if _speaks():
+            error.show()
         sys.exit(error.exit_code)
     except (click.Abort, KeyboardInterrupt):
-        click.echo("\ninterrupted: what was finished is kept; the same command goes on from there.", err=True)
-        sys.exit(130)
-    except ModuleNotFoundError as error:
-        click.echo(f"error: {error}. {_where_from(error.name or '')}", err=True)
-        sys.exit(2)
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
+        _end("\ninterrupted: what was finished is kept; the same command goes on from there.", 130)
+    except FailedElsewhere:
+        sys.exit(2)  # whoever failed has said why
+    except (ImportError, MemoryError, OSError, RuntimeError, ValueError) as error:
+        message = _message(error)
+        if message is None:
             raise
-        click.echo(
-            "error: the disk is full. What was written whole is kept; make room and run the same command again.",
-            err=True,
-        )
-        sys.exit(2)
-    except (ValueError, RuntimeError) as error:
-        if not _is_ours(error):
-            raise
-        click.echo(f"error: {error}", err=True)
-        sys.exit(2)
+        _end(f"error: {message}", 2)
+
+
+def _end(message: str, code: int) -> NoReturn:
+    if _speaks():
+        click.echo(message, err=True)
+    sys.exit(code)
+
+
+def _speaks() -> bool:
+    """Whether this process is no rank of a job, or the first: what all ranks find is said once."""
+    names = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")
+    return next((os.environ[name] for name in names if name in os.environ), "0") == "0"
+
+
+def _message(error: Exception) -> str | None:
+    """What to tell the user of an error; None for one that is a defect of this program."""
+    if isinstance(error, ModuleNotFoundError):
+        return f"{error}. {_where_from(error.name or '')}"
+    if isinstance(error, MemoryError):
+        return "there is not enough memory for this; a coarser mesh or fewer samples need less."
+    if isinstance(error, OSError):
+        return _system_message(error)
+    return str(error) if _is_ours(error) else None
+
+
+def _system_message(error: OSError) -> str | None:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "the disk is full. What was written whole is kept; make room and run the same command again."
+    if error.filename is None:
+        return str(error) if _is_ours(error) else None
+    if error.errno in (errno.EEXIST, errno.ENOTDIR):
+        return f"{error.filename}: expected a folder, found a file; choose another place to write to."
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{error.filename}: {error.strerror}; choose a place that you may read and write."
+    return f"{error.filename}: {error.strerror}."
 
 
 def _is_ours(error: Exception) -> bool:
@@ -328,8 +364,8 @@ def _where_from(module: str) -> str:
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    if issubclass(category, UnitWarning):
-        click.echo(f"warning: {message}", err=True)
+    if not issubclass(category, _FOR_DEVELOPERS):
+        click.echo(f"warning: {' '.join(str(message).split())}", err=True)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -11,6 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
+
+
+_SURFACES = (".stl", ".ply", ".obj", ".vtp")
 
 
 class ConfigError(ValueError):
@@ -92,6 +96,12 @@ class SamplesSection(_Section):
     seed: int = Field(0, ge=0, description="seed of everything random")
     ranks: int = Field(0, ge=0, description="MPI ranks that build and quickstart start; 0: one a core")
 
+    @model_validator(mode="after")
+    def _path_divides_block(self) -> SamplesSection:
+        if self.block % self.path:
+            raise ValueError(f"samples.path: expected a divisor of samples.block ({self.block}), got {self.path}")
+        return self
+
 
 class SolverSection(_Section):
     """Newton's method in the reference."""
@@ -109,7 +119,10 @@ class TrainingSection(_Section):
     )
     modes: Count = Field(64, description="displacement modes (POD) of the reduced network")
     width: Count = Field(256, description="width of its blocks")
-    seconds: Positive = Field(120.0, description="time to train")
+    seconds: Positive = Field(
+        120.0, description="wall time to train: ends with the step under way; reading the data not counted"
+    )
+    epochs: int = Field(0, ge=0, description="passes over the samples instead, whatever time they take; 0: by seconds")
     seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
 
 
@@ -153,6 +166,17 @@ class Config(_Section):
             raise ValueError(f"loads.radius: expected smallest <= largest, got {self.loads.radius}")
         return self
 
+    @model_validator(mode="after")
+    def _modes_fit_the_nodes(self) -> Config:
+        """Refuse before meshing what no mesh of so many nodes has; the mesh itself is asked again."""
+        most = 3 * self.body.nodes // 2
+        solid = self.body.cell_size == 0.0 and Path(self.body.source).suffix.lower() in _SURFACES
+        if solid and self.loads.modes > most:
+            raise ValueError(
+                f"loads.modes: expected at most {most} with body.nodes = {self.body.nodes}, got {self.loads.modes}"
+            )
+        return self
+
 
 def read_config(path: Path | str) -> tuple[Config, Path]:
     """A checked configuration, and the folder that its relative paths start from.
@@ -182,11 +206,15 @@ def parse_config(entries: dict[str, Any], source: str = "configuration") -> Conf
     try:
         return Config.model_validate(entries)
     except ValidationError as error:
-        lines = [
-            f"  {'.'.join(map(str, item['loc'])) or 'configuration'}: {item['msg']}, got {item['input']!r}"
-            for item in error.errors()
-        ]
+        lines = [f"  {_described(item)}" for item in error.errors()]
         raise ConfigError("\n".join([f"{source}: {len(lines)} wrong entries", *lines])) from None
+
+
+def _described(item: Any) -> str:
+    message = item["msg"].removeprefix("Value error, ")
+    if isinstance(item["input"], dict | BaseModel):  # of a whole section: the message names the entry and what came
+        return message
+    return f"{'.'.join(map(str, item['loc'])) or 'configuration'}: {message}, got {reprlib.repr(item['input'])}"
 
 
 def to_toml(config: Config) -> str:

@@ -44,7 +44,7 @@ from .pictures import (
 )
 from .record import NOTICE
 from .sequences import find_registrations, sequence_section
-from .workspace import Workspace
+from .workspace import Workspace, read_records
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -499,8 +499,7 @@ def _compared(found: Sequence[_State], targets: Mapping[str, Embedding]) -> Sect
 
 def record_section(space: Workspace, studio: Studio) -> Section:
     """What it takes to make the same again: configuration, versions, times, the twin's card."""
-    times, card = space.folder / "stages.json", space.twin / "surrogate.json"
-    stages = json.loads(times.read_text()) if times.exists() else {}
+    stages, card = read_records(space.folder), space.twin / "surrogate.json"
     return {
         "stages": stages,
         "total": sum(stage["seconds"] for stage in stages.values()),

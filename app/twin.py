@@ -33,7 +33,7 @@ from softtwin.registration.unknowns import Forces, Informed, PosePrior, informed
 from softtwin.registration.verdict import Judgement, Verdict
 
 from .config import Config, ConfigError, RegistrationSection, parse_config
-from .stages.generate import load_plan
+from .inputs import check_material, load_plan
 from .workspace import open_workspace
 
 Floats = NDArray[np.float64]
@@ -388,7 +388,7 @@ def find_twin(place: Path | str) -> Home:
         place: a twin's folder, the folder that its stages were run in, or the configuration file of that.
 
     Raises:
-        ConfigError: the place is none of them.
+        ConfigError: the place is none of them, or its material is not the one that its surrogate has learned.
     """
     place = Path(place)
     if place.is_file():
@@ -405,6 +405,7 @@ def find_twin(place: Path | str) -> Home:
         file, config = folder / "body.vtu", open_workspace(folder / "organ.toml").config
     if not file.is_file():
         raise ConfigError(f"twin: expected the body in {file}, found none; run `softtwin mesh {place}` first.")
+    check_material(folder, config)
     return Home(folder, read_body(file), config)
 
 

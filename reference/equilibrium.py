@@ -30,6 +30,7 @@ _GROWTH, _CUT = 1.5, 0.5  # of load steps after a success and a failure
 _FIRST_STEP = 0.25  # of the load where the whole load has failed
 _SMALLEST_STEP = 1e-6  # of the load; where not even that can be added there is a limit point
 _SHARES = (1.0, 0.5, 0.25)  # of the load whose linear response is warped for a start
+_TRUSTED = 0.9  # of the decrease that the tangent promises: less, and the warped response may be the better start
 _LOST = 1e-12  # relative force on held nodes that may be round-off
 
 
@@ -138,15 +139,16 @@ class Problem:
     ) -> Equilibrium:
         """The displacement that balances a load.
 
-        Tries the full load from the guess, then from the warped linear response, then from rest, then in load steps
-        that are halved where they fail and grow again where they succeed.
+        Tries the full load from the guess, then from the warped linear response (before the guess where an equilibrium
+        is too far), then from rest, then in load steps that are halved where they fail and grow where they succeed.
 
         Args:
             load: the load, or nodal forces alone, (n, 3), newtons.
             guess: displacement to start from, (n, 3), metres, or another equilibrium, which is first moved along its
                 tangent by the change of the load; the warped linear response if not given.
             stability: also factor the tangent at the state and count its negative pivots.
-            fallback: try the other ways where the first start fails; without, a failure is raised at once.
+            fallback: try the other ways where the guess fails; without, a failure there (and from the warped linear
+                response, where an equilibrium is too far) is raised at once.
             trace: keep every iteration in the result.
 
         Raises:
@@ -154,23 +156,21 @@ class Problem:
             NotConverged: no way led to an equilibrium; it holds the last one that was found on the way.
         """
         given, wanted = self._load(load)
-        start = self._start(guess, wanted)
-        self._newton.suit(wanted)
         self._newton.start_count()
         spent = 0
         if self.options.first_step == 1.0 or guess is not None:
-            for near, unknowns in self._starts(wanted, start):
-                attempt = self._newton.run(wanted, unknowns, eliminate=not near)
+            for unknowns, eliminate in self._starts(wanted, guess, fallback):
+                attempt = self._newton.run(wanted, unknowns, eliminate=eliminate)
                 spent += attempt.iterations
                 if attempt.converged:
                     found = replace(attempt, iterations=spent)
                     return self._result(found, given, wanted, load_steps=1, stability=stability, trace=trace)
-                if not fallback:
-                    raise NotConverged(
-                        f"Problem.solve: no equilibrium near the guess ({attempt.reason_name} after "
-                        f"{attempt.iterations} iterations).",
-                        trace=tuple(self._newton.trace),
-                    )
+            if not fallback:
+                raise NotConverged(
+                    f"Problem.solve: no equilibrium near the guess ({attempt.reason_name} after {spent} iterations). "
+                    "Try a smaller change of the load, or fallback=True.",
+                    trace=tuple(self._newton.trace),
+                )
         return self._solve_in_steps(given, wanted, spent, stability, trace)
 
     def _load(self, load: Loading | ArrayLike) -> tuple[Loading, Load]:
@@ -190,29 +190,58 @@ class Problem:
                 f"(first {where[:5]}), which would be lost; set them to zero or move them to free nodes."
             )
 
-    def _start(self, guess: ArrayLike | Equilibrium | None, load: Load) -> Floats | None:
-        """The guess as unknowns, held ones where the load wants them."""
-        if guess is None:
-            return None
+    def _starts(
+        self, load: Load, guess: ArrayLike | Equilibrium | None, fallback: bool
+    ) -> Iterator[tuple[Floats, bool]]:
+        """States to start from, the most promising first, and whether cells may be balanced alone on the way.
+
+        They may not where the equilibrium next to the guess is wanted: with them it may be another.
+        """
+        near, is_trusted = (None, False) if guess is None else self._near(guess, load)
+        if near is not None and is_trusted:
+            yield near, False
+            if not fallback:
+                return
+        starts = [self._first_guess(load)]
+        if near is not None and not is_trusted:
+            starts = sorted([*starts, near], key=lambda start: self._merit(start, load))
+        for start in starts:
+            yield start, True
+        if fallback and not self._has_lift(load):
+            yield np.zeros_like(load.dead), True
+
+    def _near(self, guess: ArrayLike | Equilibrium, load: Load) -> tuple[Floats, bool]:
+        """The guess, an equilibrium moved along its tangent by the change of the load, and whether that can be trusted.
+
+        A large change leads astray: from there Newton's method needs up to ten times the factorisations that it needs
+        from the warped response.
+        """
         start = self._unknowns(guess, "guess")
         start[self._space.fixed] = load.lift[self._space.fixed]
-        return self._ahead(guess, start, load) if isinstance(guess, Equilibrium) else start
-
-    def _ahead(self, state: Equilibrium, start: Floats, load: Load) -> Floats:
-        """A state moved along its tangent by the change of the load, unless that turns a cell inside out."""
+        if not isinstance(guess, Equilibrium):
+            return start, True
         gap = self._forms.residual(start, load)
         gap[self._space.fixed] = 0.0
-        self._linearise(state)
-        ahead = start - self._newton.linear.solve(gap[None])[0]
-        return ahead if np.isfinite(self._forms.energy(ahead)) else start
+        self._linearise(guess)
+        step = -self._newton.linear.solve(gap[None])[0]
+        at, ahead = self._merit(start, load), self._merit(start + step, load)
+        promised = at if self._space.mixed else -0.5 * self._space.dot(gap, step)
+        if 0.0 <= _TRUSTED * promised <= at - ahead:
+            return start + step, True
+        return (start + step, False) if ahead < at else (start, False)
 
-    def _starts(self, load: Load, guess: Floats | None) -> Iterator[tuple[bool, Floats]]:
-        """States to start from, and whether the equilibrium near them is wanted, and not one that is near rest."""
-        if guess is not None:
-            yield True, guess
-        yield False, self._first_guess(load)
-        if not self._has_lift(load):
-            yield False, np.zeros_like(load.dead)
+    def _merit(self, unknowns: Floats, load: Load) -> float:
+        """How far from balance a state is, less is closer: its energy under the load; infinite inside out.
+
+        With pressures as unknowns equilibrium is no minimum: the norm of the residual.
+        """
+        if self._space.mixed:
+            gap = self._forms.residual(unknowns, load)
+            merit = self._space.norm(gap) if np.isfinite(self._forms.energy(unknowns)) else np.inf
+        else:
+            work = self._forms.pressure_work(np.zeros_like(unknowns), unknowns, load)
+            merit = self._forms.potential(unknowns, load) - work
+        return merit if np.isfinite(merit) else np.inf
 
     def _has_lift(self, load: Load) -> bool:
         return self._space.dot(load.lift, load.lift) > 0.0
@@ -236,7 +265,7 @@ class Problem:
         best, lowest = np.zeros_like(linear), 0.0
         for share in _SHARES:
             start = self._warped(share * linear, load)
-            energy = self._forms.potential(start, load) - self._forms.pressure_work(np.zeros_like(start), start, load)
+            energy = self._merit(start, load)
             if energy < lowest:
                 best, lowest = start, energy
             elif lowest < 0.0:
@@ -355,7 +384,7 @@ class Problem:
     # ------------------------------------------------------------------ the tangent at a state
 
     def energy(self, displacement: ArrayLike | Equilibrium) -> float:
-        """Strain energy of a displacement (n, 3), joules; NaN where a cell is inside out."""
+        """Strain energy of a displacement (n, 3), joules; infinite where a cell is inside out."""
         return self._forms.energy(self._unknowns(displacement))
 
     def internal_forces(self, displacement: ArrayLike | Equilibrium) -> Floats:
@@ -429,12 +458,13 @@ class Problem:
         count = self.body.points.size
         if right.shape[:1] != (count,) or right.ndim > 2:
             raise ValueError(f"apply_inverse.columns: expected shape ({count}, k), got {right.shape}.")
+        if not np.isfinite(right).all():
+            raise ValueError("apply_inverse.columns: expected finite numbers, got NaN or infinity.")
         self._linearise(displacement)
-        stacked = right.reshape(count, -1).T.reshape(-1, *self.body.points.shape)
-        rows = np.array([self._space.unknowns("columns", field) for field in stacked])
+        rows = self._space.rows(right.reshape(count, -1).T.reshape(-1, *self.body.points.shape))
         rows[:, self._space.fixed] = 0.0
         solved = self._newton.linear.solve(rows, transpose)
-        return np.array([self._space.field(row).ravel() for row in solved]).T.reshape(right.shape)
+        return self._space.field(solved).reshape(len(rows), count).T.reshape(right.shape)
 
     def negative_pivots(self, displacement: ArrayLike | Equilibrium | None = None) -> int | None:
         """Negative pivots of the tangent at a state: 0 is stable.

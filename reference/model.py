@@ -13,6 +13,7 @@ from softtwin.meshes.body import Body
 
 from .equilibrium import Problem
 from .loading import Loading, checked_array
+from .materials import Material
 from .outcome import Equilibrium
 
 Floats = NDArray[np.float64]
@@ -46,6 +47,11 @@ class ReferenceModel:
         """The body that deforms."""
         return self.problem.body
 
+    @property
+    def error(self) -> float:
+        """0: it is what others are measured by."""
+        return 0.0
+
     def solve(self, forces: ArrayLike, near: Start | None = None) -> ReferenceState:
         """The state under nodal forces, (n, 3) newtons.
 
@@ -63,7 +69,7 @@ class ReferenceModel:
         load = replace(self.loading, forces=given if fixed is None else given + np.asarray(fixed))
         start = near.equilibrium if isinstance(near, ReferenceState) else None if near is None else near.displacement
         found = self.problem.solve(load, start, stability=False, fallback=self.patient or start is None)
-        return ReferenceState(given, found, self)
+        return ReferenceState(given, found, self, self.problem.material)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +82,13 @@ class ReferenceState:
         forces: nodal forces in balance, (n, 3), newtons.
         equilibrium: what they led to.
         model: where it was found.
+        material: that the body had then.
     """
 
     forces: Floats
     equilibrium: Equilibrium
     model: ReferenceModel
+    material: Material
 
     @property
     def displacement(self) -> Floats:
@@ -96,11 +104,26 @@ class ReferenceState:
         """Negative pivots of the tangent, counted when first asked for: 0 is stable, None is not known."""
         if self.equilibrium.negative_pivots is not None:
             return self.equilibrium.negative_pivots
-        return self.model.problem.negative_pivots(self.equilibrium)
+        return self._problem.negative_pivots(self.equilibrium)
+
+    @property
+    def _problem(self) -> Problem:
+        """The problem, while its tangents are still this state's."""
+        problem = self.model.problem
+        if problem.material is not self.material:
+            raise RuntimeError(
+                f"ReferenceState: expected the material that it was found with, {self.material!r}, "
+                f"got {problem.material!r}; solve again after set_material."
+            )
+        return problem
 
     def push(self, changes: ArrayLike) -> Floats:
-        """Changes of the displacement, (3n, k), for small changes of the forces, (3n, k)."""
-        return self.model.problem.apply_inverse(changes, self.equilibrium)
+        """Changes of the displacement, (3n, k), for small changes of the forces, (3n, k).
+
+        Raises:
+            RuntimeError: the problem has been given another material since.
+        """
+        return self._problem.apply_inverse(changes, self.equilibrium)
 
     def pull(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3), from the one with respect to the displacement.
@@ -109,10 +132,14 @@ class ReferenceState:
 
         Args:
             cotangent: g, (n, 3), or several, (k, n, 3).
+
+        Raises:
+            ValueError: another shape.
+            RuntimeError: the problem has been given another material since.
         """
         given = np.asarray(cotangent, dtype=np.float64)
         shape = self.model.body.points.shape
         if given.ndim not in (2, 3) or given.shape[-2:] != shape:
             raise ValueError(f"State.pull: expected a cotangent of shape {shape} or (k, *{shape}), got {given.shape}.")
         columns = given.reshape(-1, self.model.body.points.size).T
-        return self.model.problem.apply_inverse(columns, self.equilibrium, transpose=True).T.reshape(given.shape)
+        return self._problem.apply_inverse(columns, self.equilibrium, transpose=True).T.reshape(given.shape)

@@ -176,6 +176,7 @@ class Newton:
             factor: part of the full load that this is, for the trace.
             eliminate: balance few cells alone where a step is cut, a few times; then give up.
         """
+        self.suit(load)
         self._load, self._factor = load, factor
         self._norms: list[float] = []
         self._search_failed = False

@@ -79,7 +79,7 @@ class Linearised:
         """
         best = self.projections / (self.information + (scales.noise / scales.force) ** 2)
         step = best - self.vectors.T @ coefficients
-        return float(np.sqrt(self.information @ step**2 / max(self.count, 1.0)))
+        return float(np.sqrt(float(self.information @ step**2) / max(self.count, 1.0)))
 
 
 def linearised(
@@ -97,8 +97,8 @@ def linearised(
     data = jacobian @ coefficients - residuals
     weighted = weights[:, None] * jacobian
     values, vectors = np.linalg.eigh(jacobian.T @ weighted)
-    values = np.maximum(values, 0.0)
-    projections = vectors.T @ (weighted.T @ data)
+    values = np.maximum(np.asarray(values, dtype=np.float64), 0.0)
+    projections: Floats = vectors.T @ (weighted.T @ data)
     seen = values > _SEEN * values.max(initial=0.0)
     explained = float((projections[seen] ** 2 / values[seen]).sum())
     rest = max(float(data @ (weights * data)) - explained, 0.0) / consistency
@@ -139,7 +139,7 @@ def find_scales(problem: Linearised, noise: Scale, force: Scale) -> Scales:
     growth = 1.0 + np.exp(2.0 * ratios)[:, None] * information
     logarithms, explained = np.log(growth).sum(axis=1), (projections**2 / information / growth).sum(axis=1)
     index = np.arange(len(log_force))[None, :] - np.arange(len(log_noise))[:, None] + len(log_noise) - 1
-    count = max(problem.count, len(information) + 1.0)
+    count = float(max(problem.count, len(information) + 1.0))
     chance = -0.5 * (logarithms[index] + (explained[index] + problem.rest) * np.exp(-2.0 * log_noise)[:, None])
     chance += (noise_prior - count * log_noise)[:, None] + force_prior[None, :]
     chance = np.exp(chance - chance.max())
@@ -151,4 +151,4 @@ def find_scales(problem: Linearised, noise: Scale, force: Scale) -> Scales:
 
 def _moments(values: Floats, chance: Floats) -> tuple[float, float]:
     mean = float(values @ chance)
-    return mean, float(np.sqrt(max((values - mean) ** 2 @ chance, 0.0)))
+    return mean, float(np.sqrt(max(float((values - mean) ** 2 @ chance), 0.0)))

@@ -46,6 +46,10 @@ class ForwardModel(Protocol):
     def body(self) -> Body:
         """The body that deforms."""
 
+    @property
+    def error(self) -> float:
+        """Error of the displacement to be reckoned with where it is worst, metres; 0 for the reference."""
+
     def solve(self, forces: ArrayLike, near: Any = None) -> State:
         """The state under nodal forces, (n, 3) newtons.
 

@@ -251,7 +251,7 @@ class LocalModel:
     def length(self) -> float:
         """Length of the whole step in posterior deviations a coefficient."""
         whole = self._solve(0.0)
-        return float(np.sqrt(max(-whole @ self.gradient, 0.0) / len(whole)))
+        return float(np.sqrt(max(-float(whole @ self.gradient), 0.0) / len(whole)))
 
     def _solve(self, damping: float) -> Floats:
         root = 1.0 / np.sqrt(self.precision)

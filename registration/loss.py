@@ -99,7 +99,8 @@ class Tukey:
 
     def weight(self, x: Floats) -> Floats:
         """(1 - (x / c)^2)^2, 0 beyond c."""
-        return np.maximum(1.0 - (x / self.c) ** 2, 0.0) ** 2
+        inside: Floats = np.maximum(1.0 - (x / self.c) ** 2, 0.0)
+        return inside * inside
 
     @cached_property
     def consistency(self) -> float:

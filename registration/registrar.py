@@ -18,13 +18,14 @@ from .gauss_newton import Found, GaussNewton, Step
 from .lbfgs import LBFGS
 from .outcome import Outcome
 from .pose import Pose
-from .problem import Problem
+from .problem import Problem, Trial
 from .residuals import SurfaceDistance
 from .thinning import thinned
-from .unknowns import Forces, PosePrior
+from .unknowns import Forces, Informed, PosePrior, contact, informed, windowed
 from .verdict import Expectations, Judgement, judge
 
 Floats = NDArray[np.float64]
+_LEFT = 1.5  # times the noise of the frame before
 _LEADING = 6  # directions of force that a cold start begins with
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
 
@@ -37,11 +38,17 @@ class RegistrationOptions:
         noise: what is believed of the standard deviation of a point's distance, metres; found from the cloud.
         solver: how the objective is minimised.
         most_points: larger clouds are thinned to so many points.
+        rounds: how often a cold start gathers the forces where it found some; 0 where a zone says where they act.
+        reach: forces within this part of the body's size are gathered together.
+        informed: which directions are kept of gathered forces.
     """
 
     noise: Scale = NOISE
     solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
     most_points: int = 1000
+    rounds: int = 0
+    reach: float = 0.035
+    informed: Informed = field(default_factory=Informed)
 
     def __post_init__(self) -> None:
         if self.most_points < 1:
@@ -49,11 +56,30 @@ class RegistrationOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class Prepared:
+    """Forces and the reduced model between them and the observed side.
+
+    Args:
+        forces: the unknown forces.
+        model: from their coefficients to the observed nodes.
+    """
+
+    forces: Forces
+    model: ReducedModel
+
+    @classmethod
+    def of(cls, model: ForwardModel, observed: SurfaceDistance, forces: Forces) -> Prepared:
+        """What can be multiplied before a cloud comes."""
+        return cls(forces, reduce_model(model, observed.nodes, forces.basis))
+
+
+@dataclass(frozen=True, eq=False)
 class Registration:
     """One registered cloud.
 
     Args:
-        coefficients: of forces and pose, (k,).
+        prepared: the forces' basis that its coefficients belong to.
+        trial: where the solver ended; the next frame starts there.
         forces: nodal forces, (n, 3), newtons.
         state: the body's state, with its derivatives.
         pose: from the body's coordinates to the cloud's.
@@ -72,7 +98,8 @@ class Registration:
         trace: one entry an iteration.
     """
 
-    coefficients: Floats
+    prepared: Prepared
+    trial: Trial
     forces: Floats
     state: State
     pose: Pose
@@ -89,6 +116,11 @@ class Registration:
     evaluations: int
     seconds: float
     trace: tuple[Step, ...]
+
+    @property
+    def coefficients(self) -> Floats:
+        """Of forces and pose, (k,)."""
+        return self.trial.coefficients
 
     @property
     def displacement(self) -> Floats:
@@ -108,9 +140,9 @@ class Registrar:
         model: forward model.
         observed: the observed side.
         forces: the unknown forces.
-        options: noise, solver, thinning.
+        options: noise, solver, thinning, search for the place of the forces.
         pose: prior of the pose; None for clouds in the body's coordinates.
-        expectations: what a usable result looks like; those of the model where it knows some.
+        expectations: what a usable result looks like; by the body's size and the noise if not given.
     """
 
     def __init__(
@@ -125,10 +157,10 @@ class Registrar:
     ) -> None:
         self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
         self.options = options or RegistrationOptions()
-        self.expectations = expectations or Expectations.of(model, self.options.noise)
-        self._reduced = reduce_model(model, observed.nodes, forces.basis)
-        self._leading_forces = forces.leading(_LEADING)
-        self._leading = reduce_model(model, observed.nodes, self._leading_forces.basis)
+        self.noise = self.options.noise.at_least(model.error)  # points tell no more than the model can meet
+        self.expectations = expectations or Expectations.of(model, self.noise)
+        self._everywhere = Prepared.of(model, observed, forces)
+        self._leading = Prepared.of(model, observed, forces.leading(_LEADING))
 
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud.
@@ -143,29 +175,52 @@ class Registrar:
         """
         begin = time.perf_counter()
         points = self._checked(cloud)
-        problem = self._problem(points, self._reduced, self.forces)
         if start is None:
-            found = self._cold(problem)
-        else:
-            found = self.options.solver.solve(problem, start.coefficients)
-        return self._result(problem, found, begin)
+            return self._cold(points, begin)
+        problem = self._problem(points, start.prepared)
+        found = self.options.solver.solve(problem, start.coefficients, start.trial)
+        result = self._result(problem, found, start.prepared, begin)
+        if self.options.rounds and self._has_left(result, start):
+            return self._cold(points, begin)
+        return result
 
-    def _problem(self, points: Floats, model: ReducedModel, forces: Forces) -> Problem:
-        return Problem(model, self.observed, forces, self.pose, points, self.options.noise)
+    def _problem(self, points: Floats, prepared: Prepared) -> Problem:
+        return Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.noise)
 
-    def _cold(self, problem: Problem) -> Found:
-        """From rest: first with the leading directions alone, which cannot fold the surface into a wrong minimum."""
-        first, solver = self._leading_forces, self.options.solver
-        start, near, spent = np.zeros(problem.size), None, 0
-        trace: tuple[Step, ...] = ()
-        if first.size < self.forces.size:
-            rough = self._problem(problem.cloud, self._leading, first)
-            begun = solver.rough().solve(rough, np.zeros(rough.size))
-            near, spent, trace = begun.trial, begun.evaluations, begun.trace
-            start[: first.size] = near.coefficients[: first.size]
-            start[self.forces.size :] = near.coefficients[first.size :]
-        found = solver.solve(problem, start, near)
-        return replace(found, evaluations=found.evaluations + spent, trace=trace + found.trace)
+    def _cold(self, points: Floats, begin: float) -> Registration:
+        """From rest; where the place of the forces is unknown, once more from rest for each round of gathering them."""
+        prepared = self._everywhere
+        found = self._from_rest(points, prepared, self._leading)
+        for _ in range(self.options.rounds):
+            inner = found.trial.coefficients[: prepared.forces.size]
+            prepared = self._gathered(prepared.forces.forces(inner))
+            spent, found = found, self._from_rest(points, prepared)
+            found = _after(spent, found)
+        return self._result(self._problem(points, prepared), found, prepared, begin)
+
+    def _from_rest(self, points: Floats, prepared: Prepared, leading: Prepared | None = None) -> Found:
+        """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
+        problem, solver = self._problem(points, prepared), self.options.solver
+        start = np.zeros(problem.size)
+        if prepared.forces.size <= _LEADING:
+            return solver.solve(problem, start)
+        first = leading or Prepared.of(self.model, self.observed, prepared.forces.leading(_LEADING))
+        rough = self._problem(points, first)
+        begun = solver.rough().solve(rough, np.zeros(rough.size))
+        start[:_LEADING] = begun.trial.coefficients[:_LEADING]
+        start[prepared.forces.size :] = begun.trial.coefficients[_LEADING:]
+        return _after(begun, solver.solve(problem, start, begun.trial))
+
+    def _gathered(self, nodal: Floats) -> Prepared:
+        """The unknown forces once more, where forces were found."""
+        body = self.model.body
+        where = contact(self.forces, nodal, body.points, self.options.reach * body.size)
+        forces = informed(windowed(self.forces, where), self.model, self.observed, self.options.informed)
+        return Prepared.of(self.model, self.observed, forces)
+
+    def _has_left(self, result: Registration, start: Registration) -> bool:
+        """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
+        return result.noise > _LEFT * max(start.noise, self.noise.least)
 
     def _checked(self, cloud: ArrayLike) -> Floats:
         points = np.asarray(cloud, dtype=np.float64)
@@ -177,13 +232,14 @@ class Registrar:
             return points
         return check_cloud(points, self.model.body)
 
-    def _result(self, problem: Problem, found: Found, begin: float) -> Registration:
-        trial, forces = found.trial, self.forces
+    def _result(self, problem: Problem, found: Found, prepared: Prepared, begin: float) -> Registration:
+        trial, forces = found.trial, prepared.forces
         inner = trial.coefficients[problem.force_part]
         nodal = forces.forces(inner)
         state = trial.state.full
         return Registration(
-            coefficients=trial.coefficients,
+            prepared=prepared,
+            trial=trial,
             forces=nodal,
             state=state,
             pose=trial.pose or Pose.identity(),
@@ -201,6 +257,11 @@ class Registrar:
             seconds=time.perf_counter() - begin,
             trace=found.trace,
         )
+
+
+def _after(first: Found, second: Found) -> Found:
+    """The second result, with what the first took."""
+    return replace(second, evaluations=first.evaluations + second.evaluations, trace=(*first.trace, *second.trace))
 
 
 def register_sequence(registrar: Registrar, clouds: Iterable[ArrayLike]) -> Iterator[Registration]:

@@ -328,9 +328,9 @@ def _judged(shape: _Shape, found: _Found, mirrored: _Found, centre: Floats) -> A
     rival = None if len(others) == 0 else 1 + int(others.argmin())
     against = float(others.min()) if len(others) else np.inf
     mirror = min(_evidence(best, other) for other in mirrored.distances)
-    inside = best < _SCALE
+    inside, inside_mirrored = best < _SCALE, mirrored.distances[0] < _SCALE
     return Alignment(
-        outcome=_outcome(shape, misfit, float(inside.mean()), against, mirror),
+        outcome=_outcome(shape, misfit, inside.mean(), inside_mirrored.mean(), against, mirror),
         pose=_pose(shape, found.motions, 0, centre),
         rms=shape.size * float(np.sqrt(np.mean(best[inside] ** 2))) if inside.any() else np.inf,
         inliers=float(inside.mean()),
@@ -347,11 +347,14 @@ def _evidence(best: Floats, other: Floats) -> float:
     told = (best < _SCALE) | (other < _SCALE)
     if not told.any():
         return 1.0
-    return float(_misfit(other[told], _SCALE)) / max(float(_misfit(best[told], _SCALE)), _FLOOR)
+    worse, better = (max(float(_misfit(distances[told], _SCALE)), _FLOOR) for distances in (other, best))
+    return worse / better
 
 
-def _outcome(shape: _Shape, misfit: float, inliers: float, against: float, mirror: float) -> Outcome:
-    if mirror * _MIRRORED < 1:
+def _outcome(
+    shape: _Shape, misfit: float, inliers: float, mirrored_inliers: float, against: float, mirror: float
+) -> Outcome:
+    if mirrored_inliers >= _FEWEST_INLIERS and mirror * _MIRRORED < 1:
         return Outcome.MIRRORED
     if inliers < _FEWEST_INLIERS:
         return Outcome.NO_MATCH

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array, csr_array
+from scipy.spatial import cKDTree
 
 from softtwin.meshes.body import Body
 
@@ -31,19 +32,26 @@ class Forces:
         basis: nodal forces of each coefficient, (3n, k), dimensionless: coefficients are in newtons.
         scale: what is believed of the coefficients' standard deviation, newtons.
         left_out: covariance of the net force of directions that were left out, for unit scale, (3, 3).
-        directions: how many directions there were before any was left out.
+        every: the basis before any direction was left out, (3n, m).
+        where: part of its expected size that a force at each node may have, (n,); None for the whole of it.
     """
 
     nodes: Ints
     basis: Floats
     scale: Scale = FORCE
     left_out: Floats = field(default_factory=lambda: np.zeros((3, 3)))
-    directions: int = 0
+    every: Floats | None = None
+    where: Floats | None = None
 
     @property
     def size(self) -> int:
         """Number of coefficients, k."""
         return self.basis.shape[1]
+
+    @property
+    def directions(self) -> int:
+        """How many directions there were before any was left out."""
+        return self.size if self.every is None else self.every.shape[1]
 
     def forces(self, coefficients: Floats) -> Floats:
         """Nodal forces, (n, 3), newtons."""
@@ -86,7 +94,7 @@ def nodal_forces(body: Body, nodes: ArrayLike, scale: Scale = FORCE, smoothness:
     basis = np.zeros((len(body.points), 3, 3 * root.shape[1]))
     for axis in range(3):
         basis[chosen, axis, axis::3] = root
-    return Forces(chosen, basis.reshape(-1, 3 * root.shape[1]), scale, directions=3 * root.shape[1])
+    return Forces(chosen, basis.reshape(-1, 3 * root.shape[1]), scale)
 
 
 def _correlation_root(positions: Floats, smoothness: float) -> Floats:
@@ -139,7 +147,43 @@ def informed(forces: Forces, model: ForwardModel, observed: SurfaceDistance, rul
     kept = vectors[:, ::-1][:, : min(rule.most, max(int((information > rule.information).sum()), 1))]
     net = forces.net_basis
     rest = net - (net @ kept) @ kept.T
-    return replace(forces, basis=forces.basis @ kept, left_out=forces.left_out + rest @ rest.T)
+    every = forces.basis if forces.every is None else forces.every
+    return replace(forces, basis=forces.basis @ kept, left_out=forces.left_out + rest @ rest.T, every=every)
+
+
+def windowed(forces: Forces, where: Floats) -> Forces:
+    """The forces where they may act: each node's share of the basis times its part.
+
+    Args:
+        forces: forces of which nothing is known of their place.
+        where: part of its expected size that a force at each node may have, (n,).
+    """
+    rows = np.repeat(where, 3)[:, None]
+    every = rows * (forces.basis if forces.every is None else forces.every)
+    basis = rows * forces.basis
+    whole, kept = (columns.reshape(-1, 3, columns.shape[1]).sum(axis=0) for columns in (every, basis))
+    return replace(forces, basis=basis, left_out=whole @ whole.T - kept @ kept.T, every=every, where=where)
+
+
+def contact(forces: Forces, nodal: Floats, positions: Floats, reach: float, least: float = 0.02) -> Floats:
+    """Where forces were found, as parts of the largest, (n,): the next prior of forces whose place is unknown.
+
+    Repeated, forces gather where the cloud asks for them (re-weighted least squares: Gorodnitsky and Rao 1997).
+
+    Args:
+        forces: the unknown forces.
+        nodal: forces found, (n, 3), newtons.
+        positions: of the nodes at rest, (n, 3), metres.
+        reach: forces within this distance count together, metres.
+        least: no part is smaller: a force elsewhere stays possible.
+    """
+    place = positions[forces.nodes]
+    size = np.linalg.norm(nodal[forces.nodes], axis=1)
+    near = cKDTree(place).sparse_distance_matrix(cKDTree(place), 3.0 * reach, output_type="coo_matrix")
+    smooth = coo_array((np.exp(-0.5 * (near.data / reach) ** 2), (near.row, near.col)), shape=near.shape) @ size
+    where = np.zeros(len(positions))
+    where[forces.nodes] = np.maximum(smooth / max(smooth.max(), 1e-300), least)
+    return where
 
 
 def _observing_rows(observed: SurfaceDistance) -> csr_array:

@@ -183,6 +183,12 @@ class Surrogate:
         self.rows = (3 * frame.loaded[:, None] + np.arange(3)).ravel()
         self._idle = np.setdiff1d(np.arange(len(body.points)), np.union1d(frame.loaded, body.fixed))
 
+    @property
+    def error(self) -> float:
+        """Largest error of a node over the body, mean of the held-out samples, metres; 0 where it was not measured."""
+        held_out = self.card.get("held_out") or {}
+        return float(held_out.get("largest_error", {}).get("mean", 0.0))
+
     def solve(self, forces: ArrayLike, near: Any = None) -> SurrogateState:
         """The state under nodal forces, (n, 3) newtons.
 

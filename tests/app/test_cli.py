@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import warnings
 from pathlib import Path
 
 import meshio
@@ -10,6 +13,7 @@ import numpy as np
 import pytest
 import pyvista
 
+from softtwin.app.cli import main
 from softtwin.app.config import BodySection, Config, to_toml
 from softtwin.app.organ import make_body
 from softtwin.meshes.files import read_body
@@ -136,9 +140,10 @@ def test_a_missing_surface_is_named(capsys, tmp_path) -> None:
     assert "nothing.stl" in build(capsys, tmp_path, tmp_path / "nothing.stl", "--fixed", tmp_path / "nothing.stl")
 
 
-def test_another_configuration_in_the_same_folder_is_refused(capsys, tmp_path, sphere) -> None:
-    build(capsys, tmp_path, sphere, "--unit", "mm", "--nodes", 200)
-    assert "another configuration" in build(capsys, tmp_path, sphere, "--unit", "mm", "--nodes", 210)
+def test_too_many_modes_are_refused_before_meshing(capsys, tmp_path, sphere) -> None:
+    (tmp_path / "organ.toml").write_text(f'body = {{source = "{sphere}", nodes = 200}}\nloads = {{modes = 301}}\n')
+    said = run(capsys, "mesh", tmp_path / "organ.toml", code=2)
+    assert said.splitlines()[1:] == ["  loads.modes: expected at most 300 with body.nodes = 200, got 301"]
 
 
 def test_ctrl_c_is_one_line_and_code_130(capsys, monkeypatch) -> None:
@@ -151,14 +156,70 @@ def test_ctrl_c_is_one_line_and_code_130(capsys, monkeypatch) -> None:
     assert "goes on from there" in run(capsys, "doctor", code=130)
 
 
-def test_a_full_disk_is_said(capsys, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "the disk is full"),
+        (OSError(errno.EDQUOT, "Disk quota exceeded", "/data/x"), "the disk is full"),
+        (PermissionError(errno.EACCES, "Permission denied", "/data/x"), "/data/x: Permission denied; choose a place"),
+        (OSError(errno.EROFS, "Read-only file system", "/data/x"), "/data/x: Read-only file system; choose a place"),
+        (IsADirectoryError(errno.EISDIR, "Is a directory", "/data/x"), "/data/x: Is a directory."),
+        (MemoryError(), "not enough memory"),
+    ],
+)
+def test_what_the_system_refuses_is_one_message(capsys, monkeypatch, error: Exception, message: str) -> None:
     from softtwin.app import doctor
 
-    def full() -> None:
-        raise OSError(28, "No space left on device")
+    def refused() -> None:
+        raise error
 
-    monkeypatch.setattr(doctor, "checks", full)
-    assert "the disk is full" in run(capsys, "doctor", code=2)
+    monkeypatch.setattr(doctor, "checks", refused)
+    said = run(capsys, "doctor", code=2)
+    assert said.startswith("error: ") and message in said and len(said.splitlines()) == 1
+
+
+def test_threads_wait_without_spinning(capsys, monkeypatch) -> None:
+    from softtwin.app import doctor
+
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    monkeypatch.setattr(doctor, "checks", list)
+    run(capsys, "doctor")
+    assert os.environ["OMP_WAIT_POLICY"] == "passive"
+
+
+@pytest.mark.parametrize("place", ["taken", "taken/within"])
+def test_a_file_where_a_folder_is_to_be_made_is_said(capsys, tmp_path, sphere, place: str) -> None:
+    (tmp_path / "taken").write_text("mine")
+    said = run(capsys, "build", sphere, "--fixed", sphere, "--output", tmp_path / place, code=2)
+    assert said.splitlines()[-1].startswith("error: ") and "taken" in said and "expected a folder" in said
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+def test_a_defect_of_the_program_is_not_hidden(monkeypatch) -> None:
+    from softtwin.app import doctor
+
+    monkeypatch.setattr(doctor, "checks", lambda: [].index(3))
+    with pytest.raises(ValueError, match="not in list"):
+        main(["doctor"])
+
+
+@pytest.mark.filterwarnings("default")
+def test_warnings_are_shown_in_one_line_but_for_those_to_developers(capsys, monkeypatch) -> None:
+    from softtwin.app import doctor
+
+    def warned() -> list:
+        warnings.warn("the mesh is\nrather coarse", UserWarning, stacklevel=1)
+        warnings.warn("invalid value", RuntimeWarning, stacklevel=1)
+        warnings.warn("use another name", DeprecationWarning, stacklevel=1)
+        warnings.warn("use another name", FutureWarning, stacklevel=1)
+        return []
+
+    before = warnings.showwarning
+    monkeypatch.setattr(doctor, "checks", warned)
+    said = run(capsys, "doctor").splitlines()
+    assert "warning: the mesh is rather coarse" in said and "warning: invalid value" in said
+    assert not any("another name" in line for line in said)
+    assert warnings.showwarning is before
 
 
 def test_stages_in_the_wrong_order_say_which_comes_first(capsys, tmp_path: Path) -> None:

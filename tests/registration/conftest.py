@@ -51,6 +51,8 @@ class Cantilever:
         self._shape = span**2
         self._shape[body.fixed] = 0.0
 
+    error = 0.0
+
     def solve(self, forces: ArrayLike, near: Any = None) -> CantileverState:
         mean = self._shape @ np.asarray(forces)
         size = float(np.abs(mean).max())
