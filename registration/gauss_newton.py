@@ -83,10 +83,10 @@ class GaussNewton:
 
     losses: tuple[Loss, ...] = (Huber(), Tukey())
     max_iterations: int = 40
-    settled: float = 0.1
-    handed_on: float = 0.5
+    settled: float = 0.2
+    handed_on: float = 1.0
     graduation: float = 0.5
-    max_step: float = 8e-3
+    max_step: float = 16e-3
     least_step: float = 1e-6
 
     def __post_init__(self) -> None:

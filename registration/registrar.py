@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import check_cloud
+from softtwin.meshes.metrics import edge_lengths
 
 from .evidence import Scale
 from .forward import ForwardModel, ReducedModel, State, reduce_model
@@ -21,10 +23,12 @@ from .pose import Pose
 from .problem import Problem, Trial
 from .residuals import SurfaceDistance
 from .thinning import thinned
-from .unknowns import Forces, Informed, PosePrior, contact, informed, windowed
+from .unknowns import Forces, Informed, PosePrior, contact, informed, nodal_forces, windowed
 from .verdict import Expectations, Judgement, judge
 
 Floats = NDArray[np.float64]
+# Of the logarithm of a nodal force. A model with an error of its own must not explain that by forces.
+EXACT_SPREAD, LEARNED_SPREAD = 1.0, 0.5
 _LEFT = 1.5  # times the noise of the frame before
 _LEADING = 6  # directions of force that a cold start begins with
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
@@ -38,7 +42,7 @@ class RegistrationOptions:
         noise: what is believed of the standard deviation of a point's distance, metres; found from the cloud.
         solver: how the objective is minimised.
         most_points: larger clouds are thinned to so many points.
-        rounds: how often a cold start gathers the forces where it found some; 0 where a zone says where they act.
+        rounds: how often a cold start gathers the forces where it found some.
         reach: forces within this part of the body's size are gathered together.
         informed: which directions are kept of gathered forces.
     """
@@ -46,7 +50,7 @@ class RegistrationOptions:
     noise: Scale = NOISE
     solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
     most_points: int = 1000
-    rounds: int = 0
+    rounds: int = 2
     reach: float = 0.035
     informed: Informed = field(default_factory=Informed)
 
@@ -257,6 +261,47 @@ class Registrar:
             seconds=time.perf_counter() - begin,
             trace=found.trace,
         )
+
+
+def prepare(
+    model: ForwardModel,
+    nodes: ArrayLike,
+    triangles: ArrayLike | None = None,
+    *,
+    force_scale: float,
+    smoothness: float = 0.02,
+    directions: int = 64,
+    options: RegistrationOptions | None = None,
+    pose: PosePrior | None = None,
+) -> Registrar:
+    """A registrar with forces at the nodes that may carry some, reduced to what a cloud can tell.
+
+    Args:
+        model: forward model.
+        nodes: nodes that may carry force.
+        triangles: the observed side, (t, 3); the whole boundary if not given.
+        force_scale: size of a nodal force to begin with, newtons; see `expected_force`.
+        smoothness: correlation length of neighbouring forces, metres; 0 for none.
+        directions: most directions of force kept.
+        options: noise, solver, thinning, rounds.
+        pose: prior of the pose; None for clouds in the body's coordinates.
+
+    Raises:
+        ValueError: no node is left on the free boundary.
+    """
+    options = options or RegistrationOptions()
+    observed = SurfaceDistance(model.body, triangles)
+    spread = LEARNED_SPREAD if model.error > 0.0 else EXACT_SPREAD
+    scale = Scale(force_scale, spread, least=1e-2 * force_scale)
+    every = nodal_forces(model.body, nodes, scale, smoothness)
+    rule = Informed(options.noise.least, scale=10.0 * force_scale, most=directions)
+    return Registrar(model, observed, informed(every, model, observed, rule), options, pose=pose)
+
+
+def expected_force(body: Body, young_modulus: float) -> float:
+    """Nodal force to begin with, newtons: 1 % of Young's modulus (Pa) over the square of a typical edge."""
+    edge = float(np.median(edge_lengths(body.points, body.cells)))
+    return 0.01 * young_modulus * edge**2
 
 
 def _after(first: Found, second: Found) -> Found:

@@ -77,6 +77,11 @@ class SurfaceDistance:
         side = np.where(np.einsum("pi,pi->p", directions, normals) < 0.0, -1.0, 1.0)
         return Match(side * lengths, side[:, None] * directions, triangles, weights)
 
+    def feet(self, match: Match) -> Floats:
+        """The closest points of a match on the surface at rest, (p, 3), metres."""
+        found: Floats = np.einsum("pk,pki->pi", match.weights, self.rest[self.triangles[match.triangles]])
+        return found
+
     def rows(self, match: Match) -> csr_array:
         """Derivative of the distances with respect to the displacement of the observed nodes, (p, 3m).
 

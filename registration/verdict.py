@@ -139,7 +139,8 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
             (verdict, f"organ and cloud do not match: points lie {1e3 * noise:.1f} mm from the surface "
                       f"(up to {1e3 * expected.noise:.1f} mm could be noise)")
         )  # fmt: skip
-    systematic = noise * np.sqrt(shared(problem.cloud, found.trial.match.distances, found.weights))
+    match = found.trial.match
+    systematic = noise * np.sqrt(shared(problem.observed.feet(match), match.distances, found.weights))
     if systematic > expected.systematic:
         verdict = Verdict.REFUSED if systematic > 2.0 * expected.systematic else Verdict.DOUBTFUL
         findings.append(
@@ -152,16 +153,16 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
     return findings
 
 
-def shared(cloud: Floats, distances: Floats, weights: Floats) -> float:
+def shared(feet: Floats, distances: Floats, weights: Floats) -> float:
     """Part of the variance of the distances that a point shares with its neighbours, between 0 and 1.
 
     Args:
-        cloud: points, (p, 3), metres.
+        feet: places of the points on the surface at rest, (p, 3), metres; in space, noise sorts points by sign.
         distances: signed, (p,), metres.
         weights: of the points, (p,); those without weight are left out.
     """
     kept = weights > 0.05
-    points, values = cloud[kept], distances[kept]
+    points, values = feet[kept], distances[kept]
     count = min(_NEIGHBOURS, len(points) - 1)
     if count < 1 or not values.any():
         return 0.0
