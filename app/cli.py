@@ -112,10 +112,13 @@ def validate(configuration: Path) -> None:
 @click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
 @click.option("--noise", type=float, help="Noise of a point, metres, that the search for it begins with.")
 @click.option("--noise-known", is_flag=True, default=None, help="Hold the noise at --noise instead of finding it.")
-@click.option("--force-scale", type=float, help="Nodal force, newtons, that the search for its size begins with.")
+@click.option(
+    "--force-scale", type=float, help="Nodal force, newtons, that the search for its size begins with; 0: by stiffness."
+)
 @click.option("--smoothness", type=float, help="Correlation length of neighbouring forces, metres; 0: none.")
 @click.option("--directions", type=int, help="Most directions of force kept.")
 @click.option("--points", type=int, help="Most points of a cloud used; larger clouds are thinned.")
+@click.option("--rounds", type=int, help="How often a cold start gathers the forces where it has found some.")
 @click.option("--solver", type=click.Choice(["gauss-newton", "l-bfgs"]), help="How the objective is minimised.")
 @click.option("--max-iterations", type=int, help="Most iterations; 0: what the solver is content with.")
 @click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")

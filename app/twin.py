@@ -25,11 +25,17 @@ from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import Registrar, Registration, RegistrationOptions
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.registrar import (
+    NOISE,
+    Registrar,
+    Registration,
+    RegistrationOptions,
+    expected_force,
+    prepare,
+)
 from softtwin.registration.rigid import align
 from softtwin.registration.thinning import thinned
-from softtwin.registration.unknowns import Forces, Informed, PosePrior, informed, nodal_forces
+from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Judgement, Verdict
 
 from .config import Config, ConfigError, RegistrationSection, parse_config
@@ -37,9 +43,7 @@ from .inputs import check_material, load_plan
 from .workspace import open_workspace
 
 Floats = NDArray[np.float64]
-_FORCE_SPREAD, _NOISE_SPREAD = 2.0, 1.5  # of the logarithms: both scales are found from the cloud
-_LEAST_NOISE = 1e-4  # metres; no camera is better
-_WIDE = 3.0  # directions are chosen for forces so many times the expected ones: those are only a beginning
+Ints = NDArray[np.int64]
 
 Camera = Pose | PosePrior | Literal["align"] | None
 """Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
@@ -82,7 +86,6 @@ class Twin:
         self._body = model.body
         self.config = config or Config()
         self._resources = resources or ExitStack()
-        self._forces: dict[str, Forces] = {}
         self._registrars: dict[str, Registrar] = {}
         self._posed: tuple[str, PosePrior, Registrar] | None = None
 
@@ -208,11 +211,6 @@ class Twin:
         """How the body carries the vertices of each inner surface, by name."""
         return target_points(self.body)
 
-    @cached_property
-    def observed(self) -> SurfaceDistance:
-        """The side that a camera sees."""
-        return SurfaceDistance(self.body, self.body.surfaces.get("observed"))
-
     def aligned(self, cloud: ArrayLike) -> PosePrior:
         """An unknown pose about the one that a cloud alone shows.
 
@@ -222,16 +220,25 @@ class Twin:
         Raises:
             CloudError: no pose explains the cloud, or more than one does.
         """
-        triangles = self.body.surfaces.get("observed", self.body.boundary)
-        found = align(Surface(self.body.points, triangles), cloud)
+        found = align(Surface(self.body.points, self._seen), cloud)
         if not found.is_found:
             raise CloudError(f"cloud: the pose was not found ({found.outcome.value}). {found.outcome.advice}")
         return self.near(found.pose)
 
+    @property
+    def _seen(self) -> Ints:
+        """The side that a camera sees, (t, 3)."""
+        return self.body.surfaces.get("observed", self.body.boundary)
+
     def near(self, pose: Pose) -> PosePrior:
         """An unknown pose about an expected one, with the deviations of the configuration."""
         options = self.config.registration
-        return PosePrior(pose, self.observed.rest.mean(axis=0), np.deg2rad(options.pose_turn), options.pose_shift)
+        return PosePrior(
+            pose,
+            self.body.points[np.unique(self._seen)].mean(axis=0),
+            np.deg2rad(options.pose_turn),
+            options.pose_shift,
+        )
 
     def registrar(self, zone: str | None = None, camera: PosePrior | None = None) -> Registrar:
         """What registers clouds with forces in a zone; prepared once (about a second), then kept.
@@ -253,10 +260,21 @@ class Twin:
         return self._registrars[zone]
 
     def _prepared(self, zone: str, camera: PosePrior | None) -> Registrar:
-        section = self.config.registration
-        if zone not in self._forces:
-            self._forces[zone] = _unknown_forces(self.model, self.observed, zone, self.config)
-        return Registrar(self.model, self.observed, self._forces[zone], _options(section), pose=camera)
+        body, section = self.body, self.config.registration
+        if camera is not None:
+            plain = self.registrar(zone)
+            return Registrar(self.model, plain.observed, plain.forces, plain.options, pose=camera)
+        if zone and zone not in body.node_sets:
+            raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
+        return prepare(
+            self.model,
+            body.node_sets[zone] if zone else loaded_nodes(body, load_plan(self.config)),
+            body.surfaces.get("observed"),
+            force_scale=section.force_scale or expected_force(body, self.config.material.young_modulus),
+            smoothness=section.smoothness,
+            directions=section.directions,
+            options=_options(section),
+        )
 
 
 class Sequence:
@@ -324,23 +342,13 @@ def _badness(result: Registration) -> tuple[int, float]:
     return list(Verdict).index(result.judgement.verdict), result.noise
 
 
-def _unknown_forces(model: ForwardModel, observed: SurfaceDistance, zone: str, config: Config) -> Forces:
-    body, section = model.body, config.registration
-    if zone and zone not in body.node_sets:
-        raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
-    nodes = body.node_sets[zone] if zone else loaded_nodes(body, load_plan(config))
-    scale = Scale(section.force_scale, _FORCE_SPREAD, least=1e-3 * section.force_scale)
-    every = nodal_forces(body, nodes, scale, section.smoothness)
-    return informed(every, model, observed, Informed(scale=_WIDE * section.force_scale, most=section.directions))
-
-
 def _options(section: RegistrationSection) -> RegistrationOptions:
-    spread = 0.0 if section.noise_known else _NOISE_SPREAD
-    noise = Scale(section.noise, spread, least=min(_LEAST_NOISE, section.noise))
+    spread = 0.0 if section.noise_known else NOISE.spread
+    noise = Scale(section.noise, spread, least=min(NOISE.least, section.noise))
     solver = LBFGS() if section.solver == "l-bfgs" else GaussNewton()
     if section.max_iterations:
         solver = replace(solver, max_iterations=section.max_iterations)
-    return RegistrationOptions(noise, solver, section.points)
+    return RegistrationOptions(noise, solver, section.points, section.rounds)
 
 
 def with_options(config: Config, options: dict[str, Any]) -> Config:

@@ -297,6 +297,7 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
         "smoothness": 0.0,
         "directions": 9,
         "points": 150,
+        "rounds": 1,
         "solver": "l-bfgs",
         "max_iterations": 60,
         "pose": "fixed",

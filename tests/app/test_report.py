@@ -161,7 +161,8 @@ def make_registration(folder: Path, body: Body, frames: int = 4) -> None:
             verdict = Judgement(*((Verdict.REFUSED, ("too <far>",)) if refused else (Verdict.ACCEPTED,)))
             state = SimpleNamespace(displacement=shape)
             result = Registration(
-                coefficients=np.zeros(3),
+                prepared=None,  # type: ignore[arg-type]
+                trial=None,  # type: ignore[arg-type]
                 forces=np.full_like(shape, 0.01),
                 state=state,  # type: ignore[arg-type]
                 pose=Pose.identity(),

@@ -69,8 +69,8 @@ def test_a_known_camera_changes_nothing_but_coordinates(plain_twin: Twin, forces
     cloud = seen_cloud(plain_twin, forces)
     plain, seen = plain_twin.register(cloud), plain_twin.register(TURNED.apply(cloud), camera=TURNED)
     assert seen.pose is TURNED
-    # Both have converged: a further step is shorter than a tenth of what is uncertain.
-    assert (np.abs(seen.net_force - plain.net_force) < 0.1 * plain.net_force_deviation).all()
+    # Both have converged: a further step is shorter than a fifth of what is uncertain.
+    assert (np.abs(seen.net_force - plain.net_force) < 0.2 * plain.net_force_deviation).all()
 
 
 def test_an_unknown_camera_is_found_with_the_forces(plain_twin: Twin, forces) -> None:
