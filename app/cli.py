@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import click
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.attachment import File, parse_file, parse_regions
-from softtwin.meshes.files import stated_frame
+from softtwin.meshes.files import Unit, stated_frame
 from softtwin.reference.ranks import FailedElsewhere
 
 from .config import LAWS, Config, ConfigError, parse_config, to_toml
@@ -109,50 +108,91 @@ def validate(configuration: Path) -> None:
 
 @softtwin.command()
 @click.argument("twin", type=_EXISTING)
-@click.argument("clouds", nargs=-1, required=True, type=_PATH)
+@click.argument("clouds", nargs=-1, required=True)
+@click.option("--model", type=click.Choice(["surrogate", "reference"]), help="Forward model.")
+@click.option("--zone", help="Node set whose nodes may carry force; '' for all loaded nodes.")
+@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
+@click.option("--noise", type=float, help="Noise of a point, metres, that the search for it begins with.")
+@click.option("--noise-known", is_flag=True, default=None, help="Hold the noise at --noise instead of finding it.")
 @click.option(
-    "--model", type=click.Choice(["surrogate", "reference"]), help="Forward model; the twin's choice if not given."
+    "--force-scale", type=float, help="Nodal force, newtons, that the search for its size begins with; 0: by stiffness."
 )
+@click.option("--smoothness", type=float, help="Correlation length of neighbouring forces, metres; 0: none.")
+@click.option("--directions", type=int, help="Most directions of force kept.")
+@click.option("--points", type=int, help="Most points of a cloud used; larger clouds are thinned.")
+@click.option("--rounds", type=int, help="How often a cold start gathers the forces where it has found some.")
+@click.option("--solver", type=click.Choice(["gauss-newton", "l-bfgs"]), help="How the objective is minimised.")
+@click.option("--max-iterations", type=int, help="Most iterations; 0: what the solver is content with.")
+@click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")
+@click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
+@click.option("--align", type=click.Choice(["auto"]), help="Look for the pose in the first cloud that shows it.")
 @click.option(
-    "--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the clouds."
+    "--pose", type=click.Choice(["fixed", "unknown"]), help="Unknown: found with the forces, as after any start."
 )
-@click.option("--zone", help="Node set whose nodes may carry force.")
-@click.option("--noise", type=float, help="Expected noise of the clouds, metres.")
-@click.option("--smoothness", type=float, help="Correlation length of neighbouring forces, metres.")
-@click.option("--truth", type=_EXISTING, help="True node positions (frames, n, 3) in .npy, metres, to state errors.")
+@click.option("--pose-turn", type=float, help="How far an unknown pose may turn from its start, degrees.")
+@click.option("--pose-shift", type=float, help="How far an unknown pose may shift from its start, metres.")
+@click.option(
+    "--format", "formats", multiple=True, help="stl, ply, vtp: surfaces; vtu: all (may be repeated).  [vtu, vtp]"
+)
+@click.option("--truth", type=_EXISTING, help="True node positions in .npy, metres, (frames, n, 3), to state errors.")
+@click.option("--strict", is_flag=True, help="End with code 3 unless every frame is accepted.")
 @click.option("--output", type=_PATH, default=Path("registration"), show_default=True, help="Folder of the results.")
 def register(
-    twin: Path, clouds: tuple[Path, ...], model: str | None, unit: str, truth: Path | None, output: Path, **chosen: Any
+    twin: Path,
+    clouds: tuple[str, ...],
+    unit: Unit | None,
+    matrix: Path | None,
+    landmarks: tuple[Path, Path] | None,
+    align: str | None,
+    formats: tuple[str, ...],
+    truth: Path | None,
+    strict: bool,
+    output: Path,
+    **chosen: Any,
 ) -> None:
-    """Register CLOUDS (one file a frame, in order) to TWIN; writes a VTU a frame and registration.json."""
-    from .register import forward_model, make_registrar, open_twin, read_clouds, register_clouds
+    """Register CLOUDS to TWIN: one file a frame, in order; a folder; or a pattern in quotes.
 
-    body, settings = open_twin(twin)
-    entries = settings.model_dump()
-    entries["registration"] |= {name: value for name, value in chosen.items() if value is not None}
-    settings = parse_config(entries, "command line")
-    frames = read_clouds(clouds, unit, body)
-    positions = None if truth is None else _read_truth(truth, len(frames), len(body.points))
-    with forward_model(model or settings.registration.model, twin, body, settings) as forward:
-        register_clouds(make_registrar(forward, settings, settings.registration), frames, output, positions, click.echo)
-    click.echo(f"{NOTICE}\nwritten to {output}")
+    Every frame has a verdict: accepted, doubtful or refused, with reasons. Written to the folder: registration.json,
+    and for each frame the organ with displacement and force (VTU) and the moved surface of each structure, in the
+    unit and frame of the organ's files; frames.pvd opens all of it in ParaView.
 
+    TWIN is a twin's folder; with --model reference a folder with a body and its configuration is enough.
+    """
+    from .export import FORMATS
+    from .register import Start, register_files
 
-def _read_truth(path: Path, frames: int, nodes: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    positions = np.load(path)
-    if positions.ndim != 3 or positions.shape[1:] != (nodes, 3) or len(positions) < frames:
-        raise ConfigError(f"--truth: expected shape ({frames} or more, {nodes}, 3), got {positions.shape} in {path}.")
-    return positions
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown:
+        raise ConfigError(f"--format: expected {', '.join(FORMATS)}, got {', '.join(unknown)}.")
+    if sum(given is not None for given in (matrix, landmarks or None, align)) > 1:
+        raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
+    options = {name: value for name, value in chosen.items() if value is not None}
+    start = Start(matrix, landmarks or None, align is not None)
+    verdicts = register_files(
+        twin, clouds, output, options, unit=unit, start=start, truth=truth, formats=formats, say=click.echo
+    )
+    said = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items() if count)
+    click.echo(f"{said}; written to {output}\n{NOTICE}")
+    if strict and verdicts["doubtful"] + verdicts["refused"]:
+        sys.exit(3)
 
 
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
-def report(configuration: Path) -> None:
-    """Write the HTML report of what CONFIGURATION's stages have made so far."""
+@click.option(
+    "--registrations", multiple=True, type=_EXISTING, help="Folder that softtwin register wrote (may be repeated)."
+)
+def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
+    """Write the HTML report of what CONFIGURATION's stages have made so far, and of registrations.
+
+    CONFIGURATION is a file or the folder that holds organ.toml. Registrations below that folder are found by
+    themselves.
+    """
     from .report import report_stage
     from .workspace import open_workspace
 
-    click.echo(f"report written to {report_stage(open_workspace(configuration))}")
+    file = configuration / "organ.toml" if configuration.is_dir() else configuration
+    click.echo(f"report written to {report_stage(open_workspace(file), registrations)}")
 
 
 @softtwin.command()

@@ -144,11 +144,24 @@ class RegistrationSection(_Section):
 
     model: Literal["surrogate", "reference"] = Field("surrogate", description="which forward model registers")
     zone: str = Field("", description="zone whose nodes may carry force; empty: all loaded nodes")
-    noise: Positive = Field(5e-4, description="noise of the cloud to begin with, metres; it is found")
-    force_scale: Positive = Field(0.01, description="nodal force to begin with, newtons; its size is found")
+    noise: Positive = Field(5e-4, description="noise of a point, metres, that the search for it begins with")
+    noise_known: bool = Field(False, description="hold the noise at that value instead of finding it")
+    force_scale: float = Field(
+        0.0, ge=0.0, description="nodal force to begin with, newtons; 0: by stiffness and mesh; its size is found"
+    )
     smoothness: float = Field(0.02, ge=0.0, description="correlation length of neighbouring forces, metres; 0: none")
-    max_iterations: Count = Field(40, description="iterations for one cloud")
     directions: Count = Field(64, description="most directions of force kept: those that a cloud tells best")
+    points: Count = Field(1000, description="most points of a cloud used: larger ones are thinned")
+    rounds: int = Field(2, ge=0, description="how often a cold start gathers the forces where it has found some")
+    solver: Literal["gauss-newton", "l-bfgs"] = Field("gauss-newton", description="how the objective is minimised")
+    max_iterations: int = Field(
+        0, ge=0, description="most iterations; 0: what the solver is content with (gauss-newton 40, l-bfgs 200 a run)"
+    )
+    pose: Literal["auto", "fixed", "unknown"] = Field(
+        "auto", description="whether the camera's pose is an unknown beside the forces; auto: where a start is given"
+    )
+    pose_turn: Positive = Field(5.0, description="how far an unknown pose may turn from its start, degrees")
+    pose_shift: Positive = Field(0.01, description="how far an unknown pose may shift from its start, metres")
 
 
 class Config(_Section):
