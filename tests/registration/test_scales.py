@@ -10,7 +10,7 @@ from softtwin.registration.evidence import Scale, find_scales, linearised
 from softtwin.registration.loss import Huber, Loss, Square, Tukey, robust_deviation
 from softtwin.registration.posterior import posterior
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import Informed, informed, nodal_forces
+from softtwin.registration.unknowns import Informed, contact, informed, nodal_forces, windowed
 
 from .conftest import Cantilever
 
@@ -110,3 +110,27 @@ def test_zones_inside_or_fixed_are_refused(body: Body) -> None:
         nodal_forces(body, body.fixed)
     with pytest.raises(ValueError, match=r"nodal_forces\.smoothness: expected a length"):
         nodal_forces(body, body.node_sets["tip"], smoothness=-1.0)
+
+
+def test_contact_is_where_the_forces_are(body: Body) -> None:
+    forces = nodal_forces(body, body.boundary_nodes, Scale(0.1, 1.0))
+    nodal = np.zeros_like(body.points)
+    pulled = forces.nodes[np.argmax(body.points[forces.nodes] @ [1.0, 0.0, 1.0])]
+    nodal[pulled] = [0.0, 0.0, 2.0]
+    where = contact(forces, nodal, body.points, reach=0.1, least=0.03)
+    distance = np.linalg.norm(body.points - body.points[pulled], axis=1)
+    free = np.setdiff1d(forces.nodes, [pulled])
+    assert where[pulled] == 1.0
+    assert where[free[distance[free] > 0.31]].max() == 0.03 and where[free].min() == 0.03
+    assert (np.diff(where[free[np.argsort(distance[free])]]) <= 1e-12).all()
+
+
+def test_windowed_forces_keep_the_variance_of_what_is_left_out(body: Body) -> None:
+    every = nodal_forces(body, body.node_sets["tip"], Scale(0.1, 1.0), smoothness=0.1)
+    observed = SurfaceDistance(body, body.surfaces["observed"])
+    few = informed(every, Cantilever(body), observed, Informed(most=2))
+    where = np.linspace(0.1, 1.0, len(body.points))
+    inside = windowed(few, where)
+    whole = (np.repeat(where, 3)[:, None] * every.basis).reshape(-1, 3, every.size).sum(axis=0)
+    np.testing.assert_allclose(inside.net_basis @ inside.net_basis.T + inside.left_out, whole @ whole.T, atol=1e-9)
+    assert inside.where is where and inside.size == 2
