@@ -319,10 +319,14 @@ class Sequence:
         if self._last is not None:
             with suppress(NotConverged):
                 warm = self.twin.register(cloud, self.zone, self._last, self.camera)
-            if warm is not None and warm.judgement.verdict is Verdict.ACCEPTED:
+            if warm is not None and (warm.judgement.verdict is Verdict.ACCEPTED or self._began_anew(warm)):
                 return warm
         cold = self.twin.register(cloud, self.zone, None, self.camera)
         return cold if warm is None else min(warm, cold, key=_badness)
+
+    def _began_anew(self, result: Registration) -> bool:
+        """True where the registrar itself has gone back to rest: its forces were gathered again."""
+        return self._last is not None and result.prepared is not self._last.prepared
 
     def refuse(self, reason: str, seconds: float = 0.0) -> Frame:
         """The next frame without a result: its cloud cannot be used.
