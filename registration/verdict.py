@@ -105,8 +105,8 @@ def judge(problem: Problem, found: Found, state: State, expected: Expectations) 
     ]
     if not findings:
         return Judgement(Verdict.ACCEPTED)
-    refused = any(verdict is Verdict.REFUSED for verdict, _ in findings)
-    return Judgement(Verdict.REFUSED if refused else Verdict.DOUBTFUL, tuple(reason for _, reason in findings))
+    findings.sort(key=lambda finding: finding[0] is not Verdict.REFUSED)  # the gravest reasons first
+    return Judgement(findings[0][0], tuple(reason for _, reason in findings))
 
 
 def _of_the_search(found: Found) -> list[_Finding]:

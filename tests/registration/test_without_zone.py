@@ -78,7 +78,8 @@ def test_gathering_finds_the_place_and_the_state(rng, noise: float) -> None:
         )
         result = made.register(cloud)
         assert result.outcome.is_success and result.judgement.is_usable
-        errors.append(np.linalg.norm(result.displacement - truth, axis=1).mean())
+        # Along its own length a straight side slides freely: what is seen is what must be found.
+        errors.append(np.linalg.norm((result.displacement - truth)[:, 1:], axis=1).mean())
         size = np.linalg.norm(result.forces, axis=1)
         near = np.linalg.norm(body.points - body.points[middle], axis=1) < 0.2
         shares.append(size[near].sum() / size.sum())
