@@ -152,7 +152,11 @@ class RegistrationSection(_Section):
     smoothness: float = Field(0.02, ge=0.0, description="correlation length of neighbouring forces, metres; 0: none")
     directions: Count = Field(64, description="most directions of force kept: those that a cloud tells best")
     points: Count = Field(1000, description="most points of a cloud used: larger ones are thinned")
-    rounds: int = Field(2, ge=0, description="how often a cold start gathers the forces where it has found some")
+    rounds: int = Field(
+        -1,
+        ge=-1,
+        description="how often a cold start gathers the forces where it has found some; -1: as the model and zone ask",
+    )
     solver: Literal["gauss-newton", "l-bfgs"] = Field("gauss-newton", description="how the objective is minimised")
     max_iterations: int = Field(
         0, ge=0, description="most iterations; 0: what the solver is content with (gauss-newton 40, l-bfgs 200 a run)"

@@ -32,6 +32,7 @@ from softtwin.registration.registrar import (
     RegistrationOptions,
     expected_force,
     prepare,
+    rounds_for,
 )
 from softtwin.registration.rigid import align
 from softtwin.registration.thinning import thinned
@@ -273,7 +274,7 @@ class Twin:
             force_scale=section.force_scale or expected_force(body, self.config.material.young_modulus),
             smoothness=section.smoothness,
             directions=section.directions,
-            options=_options(section),
+            options=_options(section, rounds_for(self.model, bool(zone))),
         )
 
 
@@ -346,13 +347,13 @@ def _badness(result: Registration) -> tuple[int, float]:
     return list(Verdict).index(result.judgement.verdict), result.noise
 
 
-def _options(section: RegistrationSection) -> RegistrationOptions:
+def _options(section: RegistrationSection, rounds: int) -> RegistrationOptions:
     spread = 0.0 if section.noise_known else NOISE.spread
     noise = Scale(section.noise, spread, least=min(NOISE.least, section.noise))
     solver = LBFGS() if section.solver == "l-bfgs" else GaussNewton()
     if section.max_iterations:
         solver = replace(solver, max_iterations=section.max_iterations)
-    return RegistrationOptions(noise, solver, section.points, section.rounds)
+    return RegistrationOptions(noise, solver, section.points, rounds if section.rounds < 0 else section.rounds)
 
 
 def with_options(config: Config, options: dict[str, Any]) -> Config:

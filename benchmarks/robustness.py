@@ -1,6 +1,6 @@
 """Registration under real conditions: noise, outliers, wrong pose, thinned clouds, no zone, nonsense; both models.
 
-    python benchmarks/robustness.py --twin TWIN [--draws 8] [--reference-draws 1] [--rows surrogate ...]
+    python benchmarks/robustness.py --twin TWIN [--draws 8] [--reference-draws 1] [--rows clean ...]
 
 Frames 0-9 of s1, s2, s3 of the public liver, each cold and then warm (from the clean solution of its own frame before
 in the same draw), no option but the zone, or not even that. Each row is written as it is finished; the same command
@@ -29,7 +29,14 @@ from softtwin.meshes.shapes import liver_phantom
 from softtwin.reference.outcome import NotConverged
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import Registrar, Registration, expected_force, prepare
+from softtwin.registration.registrar import (
+    Registrar,
+    Registration,
+    RegistrationOptions,
+    expected_force,
+    prepare,
+    rounds_for,
+)
 from softtwin.registration.unknowns import PosePrior
 
 Floats = NDArray[np.float64]
@@ -82,7 +89,6 @@ ROWS: dict[str, tuple[Callable[[Floats, Body, Generator], Floats], bool, bool]] 
     "no zone, noise 2 mm": (noisy(2.0), False, False),
     "no zone, noise 5 mm": (noisy(5.0), False, False),
 }
-FRAMES = range(10)
 
 
 @contextmanager
@@ -102,12 +108,15 @@ def forward_model(name: str, twin: Path) -> Iterator[ForwardModel]:
         yield ReferenceModel(problem, patient=False)
 
 
-def registrar_for(model: ForwardModel, zone: NDArray[np.int64], pose: PosePrior | None = None) -> Registrar:
+def registrar_for(
+    model: ForwardModel, zone: NDArray[np.int64], zoned: bool, pose: PosePrior | None = None
+) -> Registrar:
     return prepare(
         model,
         zone,
         model.body.surfaces["observed"],
         force_scale=expected_force(model.body, YOUNG_MODULUS),
+        options=RegistrationOptions(rounds=rounds_for(model, zoned)),
         pose=pose,
     )
 
@@ -142,7 +151,7 @@ def figures(result: Registration, pose: Pose, data: Sequence, frame: int, rest: 
     }
 
 
-def run_row(name: str, model: ForwardModel, draws: int) -> list[dict[str, Any]]:
+def run_row(name: str, model: ForwardModel, draws: int, frames: int) -> list[dict[str, Any]]:
     """All frames of a row: cold, and warm from the frame before."""
     degrade, zoned, posed = ROWS[name]
     body, centre = model.body, model.body.points.mean(axis=0)
@@ -151,11 +160,11 @@ def run_row(name: str, model: ForwardModel, draws: int) -> list[dict[str, Any]]:
         data = sequence(s)
         zone = data.zone if zoned else np.unique(np.concatenate([body.node_sets[z] for z in SEQUENCES]))
         prior = PosePrior(Pose.identity(), centre) if posed else None
-        registrar = registrar_for(model, zone, prior)
+        registrar = registrar_for(model, zone, zoned, prior)
         for draw in range(draws):
             pose = random_pose(np.random.default_rng([7, draw]), centre) if posed else Pose.identity()
             last: Registration | None = None
-            for frame in FRAMES:
+            for frame in range(frames):
                 rng = np.random.default_rng([draw, frame, *name.encode()])
                 cloud = pose.apply(degrade(data.clouds[frame], body, rng))
                 for start in ("cold", "warm"):
@@ -219,7 +228,7 @@ def nonsense(model: ForwardModel) -> list[dict[str, Any]]:
         "another organ": other,
         "beyond what was learned (1.35 times as large)": stretched[rng.choice(np.unique(body.boundary), 500)],
     }
-    registrar = registrar_for(model, data.zone)
+    registrar = registrar_for(model, data.zone, True)
     rows = []
     for name, points in clouds.items():
         try:
@@ -238,6 +247,9 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=["surrogate", "reference"])
     parser.add_argument("--draws", type=int, default=8)
     parser.add_argument("--reference-draws", type=int, default=1)
+    parser.add_argument("--frames", type=int, default=10)
+    parser.add_argument("--reference-frames", type=int, default=10)
+    parser.add_argument("--no-nonsense", action="store_true", help="leave out clouds that show no state of the organ")
     parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=list(ROWS))
     parser.add_argument("--again", action="store_true", help="make rows again that are there")
     arguments = parser.parse_args()
@@ -245,17 +257,19 @@ def main() -> None:
     found = json.loads(path.read_text())["figures"] if path.exists() and not arguments.again else {}
     with threadpool_limits(1):
         for name in arguments.models:
-            draws = arguments.draws if name == "surrogate" else arguments.reference_draws
+            is_fast = name == "surrogate"
+            draws = arguments.draws if is_fast else arguments.reference_draws
+            frames = arguments.frames if is_fast else arguments.reference_frames
             with forward_model(name, arguments.twin) as model:
                 part_ = found.setdefault(name, {})
                 for row in arguments.rows:
                     count = 1 if ROWS[row][0] is clean and not ROWS[row][2] else draws
                     if row not in part_:
-                        part_[row] = {"draws": count, **summary(run_row(row, model, count))}
+                        part_[row] = {"draws": count, "frames": frames, **summary(run_row(row, model, count, frames))}
                         write(NAME, found)
                     for start in ("cold", "warm"):
                         show(name, row, start, part_[row].get(start))
-                if "nonsense" not in part_:
+                if "nonsense" not in part_ and not arguments.no_nonsense:
                     part_["nonsense"] = nonsense(model)
                     write(NAME, found)
 

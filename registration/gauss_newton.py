@@ -119,15 +119,16 @@ class _Search:
 
     def __init__(self, options: GaussNewton, problem: Problem, start: Floats, near: Trial | None) -> None:
         self.options, self.problem = options, problem
-        self.trial = problem.trial(start, near, anew=True)
+        self.trial = problem.trial(start, near, anew=near is None or near.cloud is not problem.cloud)
         self.evaluations, self.limit = 1, options.max_step
         self.noise = max(robust_deviation(self.trial.match.distances), problem.noise.least)
         self.trace: list[Step] = []
 
     def run(self) -> Found:
-        for loss in self.options.losses[:-1]:
-            self._descend(loss, self.options.handed_on)
-        outcome = self._descend(self.options.losses[-1], self.options.settled)
+        options = self.options
+        for loss in options.losses[:-1]:
+            self._descend(loss, options.handed_on)
+        outcome = self._descend(options.losses[-1], options.settled)
         local = self._local(self.options.losses[-1])
         return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
 
@@ -141,18 +142,19 @@ class _Search:
             local = self._local(loss)
             length = local.length
             if length < settled and not local.is_graduated:
-                again = self.problem.again(self.trial)
-                if np.array_equal(again.match.triangles, self.trial.match.triangles):
-                    return Outcome.CONVERGED
-                same = np.abs(again.match.distances - self.trial.match.distances).max() < 0.1 * self.noise
-                self.trial = again
-                if same:
+                if settled >= self.options.handed_on or self._is_closest():
                     return Outcome.CONVERGED
                 continue
             refused = self._step(local, loss)
             if refused is not None:
                 return refused
         return Outcome.MOST_ITERATIONS
+
+    def _is_closest(self) -> bool:
+        """Search the closest points anew; True where that changes nothing beside the noise."""
+        before, self.trial = self.trial, self.problem.again(self.trial)
+        changed = np.abs(self.trial.match.distances - before.match.distances).max()
+        return bool(changed < 0.1 * self.noise)
 
     def _step(self, local: LocalModel, loss: Loss) -> Outcome | None:
         """Take the best step within the limit; None when one was taken."""

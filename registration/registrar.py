@@ -298,6 +298,16 @@ def prepare(
     return Registrar(model, observed, informed(every, model, observed, rule), options, pose=pose)
 
 
+def rounds_for(model: ForwardModel, has_zone: bool) -> int:
+    """How often a cold start gathers the forces: not where an exact model is told their place, and solves are dear.
+
+    Args:
+        model: forward model.
+        has_zone: the nodes that may carry force are those that a tool can touch.
+    """
+    return 0 if has_zone and model.error == 0.0 else 2
+
+
 def expected_force(body: Body, young_modulus: float) -> float:
     """Nodal force to begin with, newtons: 1 % of Young's modulus (Pa) over the square of a typical edge."""
     edge = float(np.median(edge_lengths(body.points, body.cells)))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _SEARCHES = 12
+_DRAWN = 200_000  # points that are looked at; of more, that many drawn evenly
 _LOOKED_AT = 50_000  # points that the size of the voxels is found on
 
 
@@ -27,7 +28,7 @@ def thinned(cloud: Floats, most: int) -> Ints:
         raise ValueError(f"thinned.most: expected at least 1 point, got {most}.")
     if len(cloud) <= most:
         return np.arange(len(cloud))
-    order = np.random.default_rng(0).permutation(len(cloud))
+    order = np.random.default_rng(0).permutation(len(cloud))[: max(_DRAWN, 4 * most)]
     sample = cloud[order[:_LOOKED_AT]]
     low, high = 0.0, float(np.ptp(cloud, axis=0).max()) + 1e-12
     for _ in range(_SEARCHES):

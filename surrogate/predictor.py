@@ -92,6 +92,10 @@ class Frame:
         """Linear part of the displacement, (3n, ...), for forces at the loaded nodes, (3l, ...)."""
         return self.left @ (columns if self.right is None else self.right @ columns)
 
+    def linear_rows(self, rows: Ints, columns: Floats) -> Floats:
+        """Some rows of `linear`, (p, k), without the others' price."""
+        return self.left[rows] @ (columns if self.right is None else self.right @ columns)
+
     def linear_adjoint(self, cotangent: Floats) -> Floats:
         """Linear part of the gradient, (3l,), for a gradient with respect to the displacement, (3n,)."""
         row = cotangent @ self.left
@@ -301,7 +305,7 @@ class ReducedSurrogate:
         picked = (3 * nodes[:, None] + np.arange(3)).ravel()
         self.surrogate, self.basis = surrogate, basis
         self.encode = frame.encode @ basis
-        self.linear_rows = np.ascontiguousarray(frame.linear(basis)[picked])
+        self.linear_rows = frame.linear_rows(picked, basis)
         self.decode_rows = np.ascontiguousarray(frame.decode[picked])
         self.offset_rows = frame.offset[picked]
 
