@@ -33,7 +33,10 @@ class State(Protocol):
         """Change of the displacement, (3n, k), for small changes of the forces, (3n, k)."""
 
     def pull(self, cotangent: ArrayLike) -> Floats:
-        """Gradient with respect to the forces, (n, 3), from the one with respect to the displacement, (n, 3)."""
+        """Gradient with respect to the forces, (n, 3), from the one with respect to the displacement, (n, 3).
+
+        Several at once have the shape (k, n, 3), and so have their gradients.
+        """
 
 
 class ForwardModel(Protocol):

@@ -154,13 +154,16 @@ class SurrogateState:
         """Gradient with respect to the forces, (n, 3): J^T g, zero at nodes that never carry load.
 
         Args:
-            cotangent: g, gradient with respect to the displacement, (n, 3).
+            cotangent: g, gradient with respect to the displacement, (n, 3), or several, (k, n, 3).
 
         Raises:
             ValueError: another shape, or numbers that are not finite.
         """
+        given, shape = np.asarray(cotangent, dtype=np.float64), self.displacement.shape
+        if given.ndim == 3 and len(given):
+            return np.stack([self.pull(each) for each in given])
         frame, core = self._surrogate.frame, self._surrogate.core
-        flat = checked_array("SurrogateState.cotangent", cotangent, self.displacement.shape).ravel()
+        flat = checked_array("SurrogateState.cotangent", given, shape).ravel()
         gradient = np.zeros_like(flat)
         inner = core.pull(self._record, flat @ frame.decode)
         gradient[self._surrogate.rows] = frame.linear_adjoint(flat) + inner @ frame.encode

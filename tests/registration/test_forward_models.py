@@ -103,10 +103,18 @@ def test_a_state_is_of_its_forces_alone(model: ForwardModel, load: np.ndarray, o
         np.testing.assert_allclose(model.solve(load, near=near).displacement, cold, atol=1e-8 * np.abs(cold).max())
 
 
-def test_states_keep_what_they_are(model: ForwardModel, load: np.ndarray, other: np.ndarray, rng) -> None:
+def some_changes(data: DataSet, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Changes of the forces, (3n, count), at nodes that a surrogate has seen loaded; it refuses others."""
+    loaded = len(data.response.loaded)
+    return np.stack([whole(data, rng.standard_normal((loaded, 3))).ravel() for _ in range(count)], axis=1)
+
+
+def test_states_keep_what_they_are(
+    model: ForwardModel, load: np.ndarray, other: np.ndarray, data: DataSet, rng: np.random.Generator
+) -> None:
     """Two states of one model used by turns, while the caller writes into the forces that made them."""
     forces, cotangent = load.copy(), rng.standard_normal(load.shape)
-    changes = rng.standard_normal((load.size, 2))
+    changes = some_changes(data, 2, rng)
     first = model.solve(forces)
     before = (first.displacement.copy(), first.push(changes), first.pull(cotangent))
     forces[:] = 0.0
@@ -163,9 +171,9 @@ def test_push_and_pull_are_transposes(model: ForwardModel, load: np.ndarray, dat
     np.testing.assert_allclose(left, right, atol=1e-8 * np.abs(left).max())
 
 
-def test_many_at_once_are_each_alone(model: ForwardModel, load: np.ndarray, rng) -> None:
+def test_many_at_once_are_each_alone(model: ForwardModel, load: np.ndarray, data: DataSet, rng) -> None:
     state = model.solve(load)
-    cotangents, changes = rng.standard_normal((3, *load.shape)), rng.standard_normal((load.size, 3))
+    cotangents, changes = rng.standard_normal((3, *load.shape)), some_changes(data, 3, rng)
     pulled, pushed = state.pull(cotangents), state.push(changes)
     for i in range(3):
         np.testing.assert_allclose(state.pull(cotangents[i]), pulled[i], rtol=0.0, atol=1e-9 * np.abs(pulled).max())
