@@ -60,7 +60,7 @@ class Mending:
     def __str__(self) -> str:
         d = self.defects
         said = [
-            (d.merged_vertices, f"{d.merged_vertices} vertices merged with others at the same place"),
+            (d.merged_vertices, f"{d.merged_vertices} vertices merged with others at the same place or across a gap"),
             (d.degenerate_triangles, f"{d.degenerate_triangles} triangles without area or there twice left out"),
             (d.open_edges, f"{d.holes} holes ({d.open_edges} open edges) closed"),
             (d.crowded_edges, f"{d.crowded_edges} edges of more than two triangles resolved"),
