@@ -17,6 +17,7 @@ from .closest import polydata
 
 _log = logging.getLogger(__name__)
 _COINCIDENT = 1e-6  # of the surface's size: vertices nearer to each other are one; coordinates in single precision hold
+_GAP = 1e-3  # of the surface's size: open edges nearer to each other are one edge that was torn
 _LARGEST_LID = 0.6  # of a patch's area: a larger lid would be a second side of a sheet that has no inside
 
 
@@ -29,7 +30,7 @@ class Defects:
     """What keeps a surface from being the closed boundary of one solid, counted.
 
     Args:
-        merged_vertices: vertices that lie on another one.
+        merged_vertices: vertices that lie on another one, or across a narrow gap from it.
         degenerate_triangles: triangles that use a vertex twice, or that are there twice.
         open_edges: edges of one triangle only.
         holes: groups of open edges that hang together.
@@ -61,7 +62,7 @@ def put_in_order(surface: Surface) -> tuple[Surface, Defects]:
     Raises:
         SurfaceError: no triangle is left.
     """
-    shared = merged(surface)
+    shared = _stitched(merged(surface))
     whole = compacted(shared)
     distinct = Surface(whole.points, _distinct(whole.triangles))
     open_, crowded, clashing = _edge_counts(distinct.triangles)
@@ -88,8 +89,24 @@ def merged(surface: Surface) -> Surface:
     Args:
         surface: triangle surface, metres.
     """
+    return _merged(surface, np.arange(len(surface.points)), _COINCIDENT)
+
+
+def _stitched(surface: Surface) -> Surface:
+    """The surface with vertices along open edges merged across narrow gaps, where that closes open edges."""
+    rims = _open_edges(surface.triangles)
+    if len(rims) == 0:
+        return surface
+    stitched = _merged(surface, np.unique(rims), _GAP)
+    edges = np.sort(stitched.triangles, axis=1)
+    kept = stitched.triangles[(np.diff(edges, axis=1) != 0).all(axis=1)]
+    return stitched if len(kept) and len(_open_edges(kept)) < len(rims) else surface
+
+
+def _merged(surface: Surface, chosen: Ints, share: float) -> Surface:
+    """The surface with chosen vertices made one where they are nearer to each other than this share of its size."""
     size = float(np.linalg.norm(np.ptp(surface.points, axis=0)))
-    pairs = cKDTree(surface.points).query_pairs(_COINCIDENT * size, output_type="ndarray")
+    pairs = chosen[cKDTree(surface.points[chosen]).query_pairs(share * size, output_type="ndarray")]
     if len(pairs) == 0:
         return surface
     count, labels = _groups(pairs, len(surface.points), lone=True)

@@ -24,9 +24,8 @@ _LOWEST_QUALITY = 1e-3  # radius ratio below which a tetrahedron is a sliver tha
 _GOOD_JACOBIAN = 0.25  # scaled: cells below are mended where that goes
 # How far the boundary may lie from the surface: this part of its size, or for coarse cells this part of their edge.
 _TOLERANCE, _TOLERANCE_OF_EDGE = 3e-3, 0.08
-_TRIANGLE_EDGE = (
-    0.6  # of the cells' edge: finer triangles cost time (96 s in place of 6) and are coarsened all the same
-)
+# Of the cells' edge: with finer triangles fTetWild takes up to ten times as long, and coarsens them all the same.
+_TRIANGLE_EDGE = 0.9
 _EDGE_RATIO = 1.4  # fTetWild's wanted edge over the mean edge that it makes
 # Nodes are about this times volume / size^3 and this times area / size^2 (measured on organ surfaces).
 _NODES_IN_CUBE, _NODES_ON_SQUARE = 0.72, 1.44
@@ -60,7 +59,7 @@ class Mending:
     def __str__(self) -> str:
         d = self.defects
         said = [
-            (d.merged_vertices, f"{d.merged_vertices} vertices merged with others at the same place"),
+            (d.merged_vertices, f"{d.merged_vertices} vertices merged with others at the same place or across a gap"),
             (d.degenerate_triangles, f"{d.degenerate_triangles} triangles without area or there twice left out"),
             (d.open_edges, f"{d.holes} holes ({d.open_edges} open edges) closed"),
             (d.crowded_edges, f"{d.crowded_edges} edges of more than two triangles resolved"),
