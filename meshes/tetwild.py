@@ -48,7 +48,7 @@ def tetrahedra(surface: Surface, edge_length: float, tolerance: float) -> tuple[
             edge_length=edge_length / size,
             tolerance=tolerance / size,
         )
-        program = [sys.executable, "-m", __name__, given, made]
+        program = [sys.executable, "-m", __name__, str(given), str(made)]
         ended = subprocess.run(program, capture_output=True, text=True, cwd=folder)  # it leaves a file where it runs
         if ended.returncode != 0 or not made.exists():
             raise SurfaceError(
