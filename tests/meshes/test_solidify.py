@@ -2,6 +2,7 @@ import logging
 import re
 import signal
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -161,9 +162,13 @@ def test_a_crash_of_the_mesher_is_a_message(ball: Surface, monkeypatch: pytest.M
         solidify(ball, cell_size=SIZE)
 
 
-def test_the_mesher_leaves_ctrl_c_alone_and_says_nothing(ball: Surface, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_mesher_leaves_ctrl_c_alone_says_nothing_and_leaves_no_file(
+    ball: Surface, capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     before = signal.getsignal(signal.SIGINT)
     solidify(ball, cell_size=0.03)
+    assert list(tmp_path.iterdir()) == []
     assert signal.getsignal(signal.SIGINT) is before
     assert capfd.readouterr() == ("", "")
 
