@@ -1,95 +1,134 @@
-"""The whole chain for one organ, from its surface to a validated twin; what is there already is not made again."""
+"""The whole chain for one organ, from its surface to a validated twin; what is there and current is not made again."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
+from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_body
-from softtwin.reference.dataset import DataSet, DataSetError
+from softtwin.reference.dataset import DataSet, DataSetError, differences
+from softtwin.reference.loads import check_loads
+from softtwin.surrogate.train import CheckpointError
 
 from .config import Config, ConfigError, to_toml
+from .inputs import changes, load_plan, mesh_inputs, plan_entries, solved_data
 from .launch import generate_in_parallel
 from .register import NOTICE
+from .stages.generate import describe_data
 from .stages.learn import train_stage, validate_stage
 from .stages.mesh import mesh_stage
-from .workspace import Workspace, open_workspace
+from .workspace import Workspace, open_workspace, write_whole
+
+Say = Callable[[str], None]
 
 
-def build_twin(config: Config, output: Path, say: Callable[[str], None]) -> Workspace:
+def build_twin(config: Config, output: Path, say: Say, again: bool = False) -> Workspace:
     """Mesh, generate, train and validate.
 
     Args:
         config: the configuration; it is written to `output`/organ.toml.
         output: folder of everything that is made.
         say: prints a line.
+        again: throw away equilibria that were solved there before.
 
     Raises:
-        ConfigError: the folder was made with another configuration.
+        ConfigError: equilibria were solved there with another configuration or other files.
     """
-    space = prepare(config, output)
-    make_twin(space, output / "organ.toml", say)
+    space = prepare(config, output, again)
+    make_twin(space, output / "organ.toml", say, again)
     say(f"\ntwin: {space.twin}")
     say(f"next: softtwin register {space.twin} CLOUDS...   and: softtwin report {output / 'organ.toml'}")
     say(NOTICE)
     return space
 
 
-def prepare(config: Config, output: Path) -> Workspace:
-    """The folder with its configuration file.
+def prepare(config: Config, output: Path, again: bool = False) -> Workspace:
+    """The folder with its configuration file, which is written unless that would make solved equilibria worthless.
+
+    Args:
+        config: the configuration.
+        output: the folder.
+        again: write it in any case.
 
     Raises:
-        ConfigError: the folder holds another configuration.
+        ConfigError: equilibria were solved there with another configuration or other files.
     """
     output.mkdir(parents=True, exist_ok=True)
-    path, text = output / "organ.toml", to_toml(config)
-    if path.exists() and path.read_text() != text:
-        raise ConfigError(
-            f"{path}: this folder was made with another configuration; choose another --output, or go on with "
-            f"`softtwin generate {path}` and so forth."
-        )
-    path.write_text(text)
-    return open_workspace(path)
+    data = None if again else solved_data(Workspace(config, output))
+    if data is not None:
+        _refuse_changes(Workspace(config, output), data)
+    write_whole(output / "organ.toml", to_toml(config))
+    return open_workspace(output / "organ.toml")
 
 
-def make_twin(space: Workspace, path: Path, say: Callable[[str], None]) -> None:
-    """The stages up to the validated twin, each only where its result is missing.
+def make_twin(space: Workspace, path: Path, say: Say, again: bool = False) -> None:
+    """The stages up to the validated twin, each only where its result is missing or of other inputs.
 
     Args:
         space: the workspace.
         path: its configuration file, for the ranks that mpirun starts.
         say: prints a line.
+        again: throw away equilibria that were solved before.
+
+    Raises:
+        ConfigError: equilibria were solved there on another mesh.
     """
     say(f"1/4 mesh: {space.config.body.source}")
-    body = read_body(space.body) if space.body.exists() else mesh_stage(space)
+    body = _mesh(space, say)
     say(f"    {len(body.points)} nodes, {len(body.cells)} cells, {len(body.fixed)} fixed, {1e3 * body.volume:.2f} l")
+    check_loads(body, load_plan(space.config))
     say(_indented((space.folder / "mesh_quality.txt").read_text()))
     say("2/4 generate: eigenmodes, modal loads, equilibria")
-    if _complete(space):
-        say(f"    there already: {describe_data(DataSet(space.data))}")
-    else:
-        generate_in_parallel(path, space.config.samples.ranks)  # says itself what it has made
+    _generate(space, body, path, say, again)
     say("3/4 train: the surrogate")
-    train_stage(space)
+    try:
+        train_stage(space)
+    except CheckpointError as error:
+        say(f"    from the start: {str(error).partition(';')[0].removeprefix('train.folder: ')}")
+        train_stage(space, fresh=True)
     say("4/4 validate: held-out errors")
     say(validate_stage(space))
+
+
+def _mesh(space: Workspace, say: Say) -> Body:
+    changed = changes(space, "mesh", mesh_inputs(space))
+    if space.body.exists() and changed == []:
+        return read_body(space.body)
+    if changed:
+        say(f"    made again, what it is made of has changed: {'; '.join(changed)}")
+    return mesh_stage(space)
 
 
 def _indented(text: str) -> str:
     return "\n".join(f"    {line}" for line in text.splitlines())
 
 
-def describe_data(data: DataSet) -> str:
-    """Counts of accepted and rejected draws, with the reasons of the rejected."""
-    rejected = data.rejected()
-    counts = {reason: rejected.reasons.count(reason) for reason in sorted(set(rejected.reasons))}
-    total = sum(data.header["samples"].values())
-    because = f" ({', '.join(f'{count} {reason}' for reason, count in counts.items())})" if counts else ""
-    return f"{total - len(rejected.draws)} equilibria accepted, {len(rejected.draws)} rejected{because}"
+def _generate(space: Workspace, body: Body, path: Path, say: Say, again: bool) -> None:
+    data = None if again else solved_data(space)
+    found = [] if data is None else differences(data, body, plan_entries(space.config))
+    if found:
+        raise ConfigError(_refusal(space, found))
+    if data is not None and not data.missing_blocks() and not data.damaged_blocks():
+        say(f"    there already: {describe_data(data)}")
+        return
+    generate_in_parallel(path, space.config.samples.ranks, again)  # says itself what it has made
 
 
-def _complete(space: Workspace) -> bool:
+def _refuse_changes(space: Workspace, data: DataSet) -> None:
+    changed = changes(space, "mesh", mesh_inputs(space))
+    if changed is None:
+        changed = [f"no record in {space.folder / 'stages.json'} says what the mesh was made of"]
     try:
-        return not DataSet(space.data).missing_blocks()
-    except DataSetError:
-        return False
+        changed += differences(data, data.body, plan_entries(space.config))
+    except DataSetError as error:
+        changed.append(str(error))
+    if changed:
+        raise ConfigError(_refusal(space, changed))
+
+
+def _refusal(space: Workspace, found: list[str]) -> str:
+    return (
+        f"{space.folder}: equilibria were solved here with another configuration or other files: {'; '.join(found)}. "
+        "Choose another --output, or throw them away (`softtwin build --again`, or delete the folder)."
+    )

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import click
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.attachment import File, parse_file, parse_regions
-from softtwin.meshes.files import UnitWarning, stated_frame
+from softtwin.meshes.files import Unit, stated_frame
+from softtwin.reference.ranks import FailedElsewhere
 
 from .config import LAWS, Config, ConfigError, parse_config, to_toml
 from .register import NOTICE
 
+# What libraries tell those who write programs with them.
+_FOR_DEVELOPERS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning, ImportWarning, ResourceWarning)
 _PATH = click.Path(path_type=Path)
 _EXISTING = click.Path(exists=True, path_type=Path)
 
@@ -68,17 +69,18 @@ def mesh(configuration: Path) -> None:
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
 @click.option("--redo", multiple=True, type=int, help="Make this block again (may be repeated).")
-def generate(configuration: Path, redo: tuple[int, ...]) -> None:
-    """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped."""
-    from .chain import describe_data
-    from .stages.generate import generate_stage
-    from .workspace import open_workspace
+@click.option("--again", is_flag=True, help="Throw a data set that is there away, and make it anew.")
+def generate(configuration: Path, redo: tuple[int, ...], again: bool) -> None:
+    """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped.
 
-    space = open_workspace(configuration)
-    data = generate_stage(space, redo)
+    Blocks that are damaged are found and made again. Another body or configuration is refused.
+    """
+    from .stages.generate import describe_data, generate_stage
+
+    data = generate_stage(configuration, redo, again)
     if data is not None:
         click.echo(describe_data(data))
-        click.echo(f"written to {space.data}")
+        click.echo(f"written to {data.path}")
 
 
 @softtwin.command()
@@ -90,9 +92,7 @@ def train(configuration: Path, fresh: bool) -> None:
     from .workspace import open_workspace
 
     space = open_workspace(configuration)
-    if fresh and space.training.exists():
-        shutil.rmtree(space.training)
-    train_stage(space)
+    train_stage(space, fresh)
     click.echo(f"twin written to {space.twin}")
 
 
@@ -108,50 +108,91 @@ def validate(configuration: Path) -> None:
 
 @softtwin.command()
 @click.argument("twin", type=_EXISTING)
-@click.argument("clouds", nargs=-1, required=True, type=_PATH)
+@click.argument("clouds", nargs=-1, required=True)
+@click.option("--model", type=click.Choice(["surrogate", "reference"]), help="Forward model.")
+@click.option("--zone", help="Node set whose nodes may carry force; '' for all loaded nodes.")
+@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
+@click.option("--noise", type=float, help="Noise of a point, metres, that the search for it begins with.")
+@click.option("--noise-known", is_flag=True, default=None, help="Hold the noise at --noise instead of finding it.")
 @click.option(
-    "--model", type=click.Choice(["surrogate", "reference"]), help="Forward model; the twin's choice if not given."
+    "--force-scale", type=float, help="Nodal force, newtons, that the search for its size begins with; 0: by stiffness."
 )
+@click.option("--smoothness", type=float, help="Correlation length of neighbouring forces, metres; 0: none.")
+@click.option("--directions", type=int, help="Most directions of force kept.")
+@click.option("--points", type=int, help="Most points of a cloud used; larger clouds are thinned.")
+@click.option("--rounds", type=int, help="How often a cold start gathers the forces where it has found some.")
+@click.option("--solver", type=click.Choice(["gauss-newton", "l-bfgs"]), help="How the objective is minimised.")
+@click.option("--max-iterations", type=int, help="Most iterations; 0: what the solver is content with.")
+@click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")
+@click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
+@click.option("--align", type=click.Choice(["auto"]), help="Look for the pose in the first cloud that shows it.")
 @click.option(
-    "--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the clouds."
+    "--pose", type=click.Choice(["fixed", "unknown"]), help="Unknown: found with the forces, as after any start."
 )
-@click.option("--zone", help="Node set whose nodes may carry force.")
-@click.option("--noise", type=float, help="Expected noise of the clouds, metres.")
-@click.option("--smoothness", type=float, help="Correlation length of neighbouring forces, metres.")
-@click.option("--truth", type=_EXISTING, help="True node positions (frames, n, 3) in .npy, metres, to state errors.")
+@click.option("--pose-turn", type=float, help="How far an unknown pose may turn from its start, degrees.")
+@click.option("--pose-shift", type=float, help="How far an unknown pose may shift from its start, metres.")
+@click.option(
+    "--format", "formats", multiple=True, help="stl, ply, vtp: surfaces; vtu: all (may be repeated).  [vtu, vtp]"
+)
+@click.option("--truth", type=_EXISTING, help="True node positions in .npy, metres, (frames, n, 3), to state errors.")
+@click.option("--strict", is_flag=True, help="End with code 3 unless every frame is accepted.")
 @click.option("--output", type=_PATH, default=Path("registration"), show_default=True, help="Folder of the results.")
 def register(
-    twin: Path, clouds: tuple[Path, ...], model: str | None, unit: str, truth: Path | None, output: Path, **chosen: Any
+    twin: Path,
+    clouds: tuple[str, ...],
+    unit: Unit | None,
+    matrix: Path | None,
+    landmarks: tuple[Path, Path] | None,
+    align: str | None,
+    formats: tuple[str, ...],
+    truth: Path | None,
+    strict: bool,
+    output: Path,
+    **chosen: Any,
 ) -> None:
-    """Register CLOUDS (one file a frame, in order) to TWIN; writes a VTU a frame and registration.json."""
-    from .register import forward_model, make_registrar, open_twin, read_clouds, register_clouds
+    """Register CLOUDS to TWIN: one file a frame, in order; a folder; or a pattern in quotes.
 
-    body, settings = open_twin(twin)
-    entries = settings.model_dump()
-    entries["registration"] |= {name: value for name, value in chosen.items() if value is not None}
-    settings = parse_config(entries, "command line")
-    frames = read_clouds(clouds, unit, body)
-    positions = None if truth is None else _read_truth(truth, len(frames), len(body.points))
-    with forward_model(model or settings.registration.model, twin, body, settings) as forward:
-        register_clouds(make_registrar(forward, settings, settings.registration), frames, output, positions, click.echo)
-    click.echo(f"{NOTICE}\nwritten to {output}")
+    Every frame has a verdict: accepted, doubtful or refused, with reasons. Written to the folder: registration.json,
+    and for each frame the organ with displacement and force (VTU) and the moved surface of each structure, in the
+    unit and frame of the organ's files; frames.pvd opens all of it in ParaView.
 
+    TWIN is a twin's folder; with --model reference a folder with a body and its configuration is enough.
+    """
+    from .export import FORMATS
+    from .register import Start, register_files
 
-def _read_truth(path: Path, frames: int, nodes: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    positions = np.load(path)
-    if positions.ndim != 3 or positions.shape[1:] != (nodes, 3) or len(positions) < frames:
-        raise ConfigError(f"--truth: expected shape ({frames} or more, {nodes}, 3), got {positions.shape} in {path}.")
-    return positions
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown:
+        raise ConfigError(f"--format: expected {', '.join(FORMATS)}, got {', '.join(unknown)}.")
+    if sum(given is not None for given in (matrix, landmarks or None, align)) > 1:
+        raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
+    options = {name: value for name, value in chosen.items() if value is not None}
+    start = Start(matrix, landmarks or None, align is not None)
+    verdicts = register_files(
+        twin, clouds, output, options, unit=unit, start=start, truth=truth, formats=formats, say=click.echo
+    )
+    said = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items() if count)
+    click.echo(f"{said}; written to {output}\n{NOTICE}")
+    if strict and verdicts["doubtful"] + verdicts["refused"]:
+        sys.exit(3)
 
 
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
-def report(configuration: Path) -> None:
-    """Write the HTML report of what CONFIGURATION's stages have made so far."""
+@click.option(
+    "--registrations", multiple=True, type=_EXISTING, help="Folder that softtwin register wrote (may be repeated)."
+)
+def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
+    """Write the HTML report of what CONFIGURATION's stages have made so far, and of registrations.
+
+    CONFIGURATION is a file or the folder that holds organ.toml. Registrations below that folder are found by
+    themselves.
+    """
     from .report import report_stage
     from .workspace import open_workspace
 
-    click.echo(f"report written to {report_stage(open_workspace(configuration))}")
+    file = configuration / "organ.toml" if configuration.is_dir() else configuration
+    click.echo(f"report written to {report_stage(open_workspace(file), registrations)}")
 
 
 @softtwin.command()
@@ -181,17 +222,24 @@ def report(configuration: Path) -> None:
 @click.option(
     "--path", type=int, default=1, show_default=True, help="Draws that share a load at growing sizes (cheaper)."
 )
-@click.option("--seconds", type=float, default=120.0, show_default=True, help="Time to train.")
+@click.option(
+    "--seconds", type=float, default=120.0, show_default=True, help="Wall time to train; ends with the step under way."
+)
 @click.option("--ranks", type=int, default=0, help="MPI ranks; 0: one a core.")
 @click.option(
     "--output", type=_PATH, default=Path("twin-run"), show_default=True, help="Folder of everything that is made."
 )
-def build(surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, **given: Any) -> None:
+@click.option("--again", is_flag=True, help="Throw equilibria that were solved in OUTPUT before away.")
+def build(
+    surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, again: bool, **given: Any
+) -> None:
     r"""Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH): mesh, equilibria, surrogate, held-out errors.
 
     A surface may have holes, crumbs, overlaps, any winding: it is made solid, and what was done to it is said.
 
-    Writes OUTPUT/organ.toml with all settings; run again after an interruption, it goes on where it stopped.
+    Writes OUTPUT/organ.toml with all settings; run again after an interruption, it goes on where it stopped. With
+    other options or changed files it makes again what depends on them; only equilibria that were solved are never
+    thrown away unasked.
 
     \b
     WHERE is a file, or words. Lengths without a unit are in --unit.
@@ -229,7 +277,7 @@ def build(surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...],
         },
         "training": {"seconds": given["seconds"]},
     }
-    build_twin(parse_config(entries, "command line"), output, click.echo)
+    build_twin(parse_config(entries, "command line"), output, click.echo, again)
 
 
 def _named(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:
@@ -275,34 +323,62 @@ def quickstart(output: Path, small: bool) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors of the input are one message and exit code 2, not a traceback."""
-    warnings.showwarning = _show_warning
     # Ranks are the parallelism: on meshes of an organ's size several BLAS threads in one process only wait for another.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Threads that spin while they wait made training 14 times slower on two cores that others used as well.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
-        with threadpool_limits(int(os.environ["OPENBLAS_NUM_THREADS"]), "blas"):
+        with warnings.catch_warnings(), threadpool_limits(int(os.environ["OPENBLAS_NUM_THREADS"]), "blas"):
+            warnings.showwarning = _show_warning
             softtwin.main(args=arguments, standalone_mode=False)
     except click.ClickException as error:
-        error.show()
+        if _speaks():
+            error.show()
         sys.exit(error.exit_code)
     except (click.Abort, KeyboardInterrupt):
-        click.echo("\ninterrupted: what was finished is kept; the same command goes on from there.", err=True)
-        sys.exit(130)
-    except ModuleNotFoundError as error:
-        click.echo(f"error: {error}. {_where_from(error.name or '')}", err=True)
-        sys.exit(2)
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
+        _end("\ninterrupted: what was finished is kept; the same command goes on from there.", 130)
+    except FailedElsewhere:
+        sys.exit(2)  # whoever failed has said why
+    except (ImportError, MemoryError, OSError, RuntimeError, ValueError) as error:
+        message = _message(error)
+        if message is None:
             raise
-        click.echo(
-            "error: the disk is full. What was written whole is kept; make room and run the same command again.",
-            err=True,
-        )
-        sys.exit(2)
-    except (ValueError, RuntimeError) as error:
-        if not _is_ours(error):
-            raise
-        click.echo(f"error: {error}", err=True)
-        sys.exit(2)
+        _end(f"error: {message}", 2)
+
+
+def _end(message: str, code: int) -> NoReturn:
+    if _speaks():
+        click.echo(message, err=True)
+    sys.exit(code)
+
+
+def _speaks() -> bool:
+    """Whether this process is no rank of a job, or the first: what all ranks find is said once."""
+    names = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")
+    return next((os.environ[name] for name in names if name in os.environ), "0") == "0"
+
+
+def _message(error: Exception) -> str | None:
+    """What to tell the user of an error; None for one that is a defect of this program."""
+    if isinstance(error, ModuleNotFoundError):
+        return f"{error}. {_where_from(error.name or '')}"
+    if isinstance(error, MemoryError):
+        return "there is not enough memory for this; a coarser mesh or fewer samples need less."
+    if isinstance(error, OSError):
+        return _system_message(error)
+    return str(error) if _is_ours(error) else None
+
+
+def _system_message(error: OSError) -> str | None:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "the disk is full. What was written whole is kept; make room and run the same command again."
+    if error.filename is None:
+        return str(error) if _is_ours(error) else None
+    if error.errno in (errno.EEXIST, errno.ENOTDIR):
+        return f"{error.filename}: expected a folder, found a file; choose another place to write to."
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{error.filename}: {error.strerror}; choose a place that you may read and write."
+    return f"{error.filename}: {error.strerror}."
 
 
 def _is_ours(error: Exception) -> bool:
@@ -320,8 +396,8 @@ def _where_from(module: str) -> str:
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    if issubclass(category, UnitWarning):
-        click.echo(f"warning: {message}", err=True)
+    if not issubclass(category, _FOR_DEVELOPERS):
+        click.echo(f"warning: {' '.join(str(message).split())}", err=True)
 
 
 if __name__ == "__main__":

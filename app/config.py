@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -11,6 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
+
+
+_SURFACES = (".stl", ".ply", ".obj", ".vtp")
 
 
 class ConfigError(ValueError):
@@ -105,6 +109,12 @@ class SamplesSection(_Section):
     seed: int = Field(0, ge=0, description="seed of everything random")
     ranks: int = Field(0, ge=0, description="MPI ranks that build and quickstart start; 0: one a core")
 
+    @model_validator(mode="after")
+    def _path_divides_block(self) -> SamplesSection:
+        if self.block % self.path:
+            raise ValueError(f"samples.path: expected a divisor of samples.block ({self.block}), got {self.path}")
+        return self
+
 
 class SolverSection(_Section):
     """Newton's method in the reference."""
@@ -122,7 +132,10 @@ class TrainingSection(_Section):
     )
     modes: Count = Field(64, description="displacement modes (POD) of the reduced network")
     width: Count = Field(256, description="width of its blocks")
-    seconds: Positive = Field(120.0, description="time to train")
+    seconds: Positive = Field(
+        120.0, description="wall time to train: ends with the step under way; reading the data not counted"
+    )
+    epochs: int = Field(0, ge=0, description="passes over the samples instead, whatever time they take; 0: by seconds")
     seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
 
 
@@ -131,10 +144,28 @@ class RegistrationSection(_Section):
 
     model: Literal["surrogate", "reference"] = Field("surrogate", description="which forward model registers")
     zone: str = Field("", description="zone whose nodes may carry force; empty: all loaded nodes")
-    noise: Positive = Field(5e-4, description="expected noise of the cloud, metres")
-    force_scale: Positive = Field(0.1, description="expected size of a nodal force, newtons")
+    noise: Positive = Field(5e-4, description="noise of a point, metres, that the search for it begins with")
+    noise_known: bool = Field(False, description="hold the noise at that value instead of finding it")
+    force_scale: float = Field(
+        0.0, ge=0.0, description="nodal force to begin with, newtons; 0: by stiffness and mesh; its size is found"
+    )
     smoothness: float = Field(0.02, ge=0.0, description="correlation length of neighbouring forces, metres; 0: none")
-    max_iterations: Count = Field(40, description="iterations for one cloud")
+    directions: Count = Field(64, description="most directions of force kept: those that a cloud tells best")
+    points: Count = Field(1000, description="most points of a cloud used: larger ones are thinned")
+    rounds: int = Field(
+        -1,
+        ge=-1,
+        description="how often a cold start gathers the forces where it has found some; -1: as the model and zone ask",
+    )
+    solver: Literal["gauss-newton", "l-bfgs"] = Field("gauss-newton", description="how the objective is minimised")
+    max_iterations: int = Field(
+        0, ge=0, description="most iterations; 0: what the solver is content with (gauss-newton 40, l-bfgs 200 a run)"
+    )
+    pose: Literal["auto", "fixed", "unknown"] = Field(
+        "auto", description="whether the camera's pose is an unknown beside the forces; auto: where a start is given"
+    )
+    pose_turn: Positive = Field(5.0, description="how far an unknown pose may turn from its start, degrees")
+    pose_shift: Positive = Field(0.01, description="how far an unknown pose may shift from its start, metres")
 
 
 class Config(_Section):
@@ -153,6 +184,17 @@ class Config(_Section):
     def _radius_is_ordered(self) -> Config:
         if self.loads.radius[0] > self.loads.radius[1]:
             raise ValueError(f"loads.radius: expected smallest <= largest, got {self.loads.radius}")
+        return self
+
+    @model_validator(mode="after")
+    def _modes_fit_the_nodes(self) -> Config:
+        """Refuse before meshing what no mesh of so many nodes has; the mesh itself is asked again."""
+        most = 3 * self.body.nodes // 2
+        solid = self.body.cell_size == 0.0 and Path(self.body.source).suffix.lower() in _SURFACES
+        if solid and self.loads.modes > most:
+            raise ValueError(
+                f"loads.modes: expected at most {most} with body.nodes = {self.body.nodes}, got {self.loads.modes}"
+            )
         return self
 
 
@@ -184,11 +226,15 @@ def parse_config(entries: dict[str, Any], source: str = "configuration") -> Conf
     try:
         return Config.model_validate(entries)
     except ValidationError as error:
-        lines = [
-            f"  {'.'.join(map(str, item['loc'])) or 'configuration'}: {item['msg']}, got {item['input']!r}"
-            for item in error.errors()
-        ]
+        lines = [f"  {_described(item)}" for item in error.errors()]
         raise ConfigError("\n".join([f"{source}: {len(lines)} wrong entries", *lines])) from None
+
+
+def _described(item: Any) -> str:
+    message = item["msg"].removeprefix("Value error, ")
+    if isinstance(item["input"], dict | BaseModel):  # of a whole section: the message names the entry and what came
+        return message
+    return f"{'.'.join(map(str, item['loc'])) or 'configuration'}: {message}, got {reprlib.repr(item['input'])}"
 
 
 def to_toml(config: Config) -> str:

@@ -64,7 +64,7 @@ def checks() -> list[Check]:
     """All facts about this machine, in reading order; something missing is a line and never an error."""
     # FEniCSx first: the libraries it loads are what the BLAS line looks at.
     fenicsx = [_guarded(name, look, _SYSTEM_FENICSX if name == "dolfinx" else "") for name, look in _FENICSX.items()]
-    core = [_guarded(name, look, advice) for name, (look, advice) in _CORE.items()]
+    core = [_guarded(name, look, advice) for name, (look, advice) in {**_CORE, **_required()}.items()]
     return [*core, *fenicsx, *(_guarded(name, look, "") for name, look in _MACHINE.items())]
 
 
@@ -91,16 +91,32 @@ def _guarded(name: str, look: Callable[[], Check], advice: str) -> Check:
         return Check(name, "missing", f"{type(error).__name__}: {reason[0]}"[:200], advice)
 
 
-def _package(name: str, extra: str = "", load: bool = True) -> tuple[Callable[[], Check], str]:
-    """A check that a package is there (and loads, which tells of missing system libraries), with its advice."""
+def _package(name: str, extra: str) -> tuple[Callable[[], Check], str]:
+    """A check that a package is there, with its advice; some are loaded, which tells of missing system libraries."""
 
     def look() -> Check:
         version = metadata.version(name)
-        if load:
-            importlib.import_module(name)
+        module = name.replace("-", "_")
+        if module in _LOADED:
+            importlib.import_module(module)
         return Check(name, "ok", version)
 
     return look, f"pip install 'softtwin[{extra}]'" if extra else "pip install softtwin"
+
+
+def _required() -> dict[str, tuple[Callable[[], Check], str]]:
+    """A check for every package that softtwin names as its own need, but for those that have one already."""
+    try:
+        requirements = metadata.requires("softtwin") or []
+    except metadata.PackageNotFoundError:
+        return {}  # the line of softtwin says it
+    found: dict[str, tuple[Callable[[], Check], str]] = {}
+    for requirement in requirements:
+        named, extra = re.match(r"[\w.-]+", requirement), re.search(r"""extra == ['"]([\w-]+)['"]""", requirement)
+        part = extra.group(1) if extra else ""
+        if named and part not in _NOT_FOR_USE and named.group(0) not in _CORE:
+            found.setdefault(named.group(0), _package(named.group(0), part))
+    return found
 
 
 def _python() -> Check:
@@ -255,8 +271,13 @@ def _blas() -> Check:
     return blas_check(loaded_blas(Path("/proc/self/maps").read_text()))
 
 
+def available_cores() -> int:
+    """Cores that this process may use, which a container or a batch system may have made fewer than there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _threads() -> Check:
-    cores = len(os.sched_getaffinity(0))
+    cores = available_cores()
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
     detail = f"{cores} cores; " + ", ".join(f"{name}={os.environ.get(name, 'not set')}" for name in names)
     if cores > 1 and "1" not in (os.environ.get(name) for name in names):
@@ -300,17 +321,10 @@ _CORE: Mapping[str, tuple[Callable[[], Check], str]] = {
     "python": (_python, ""),
     "softtwin": (_softtwin, "pip install --editable . in the repository"),
     "numpy": (_numpy, "pip install numpy"),
-    "scipy": _package("scipy"),
-    "zarr": _package("zarr"),
-    "meshio": _package("meshio"),
-    "vtk": _package("vtk", load=False),
-    "gmsh": _package("gmsh", extra="mesh"),
-    "pytetwild": _package("pytetwild", extra="mesh"),
-    "pyacvd": _package("pyacvd", extra="mesh"),
     "torch": (_torch, "surrogates need it: pip install 'softtwin[torch]'"),
-    "lightning": _package("lightning", extra="torch", load=False),
-    "pyvista": _package("pyvista", extra="app", load=False),
 }
+_LOADED = ("scipy", "zarr", "meshio", "gmsh", "pytetwild", "small_gicp")
+_NOT_FOR_USE = ("fenicsx", "benchmark", "test", "dev")  # extras of developers, and FEniCSx, which has lines of its own
 _FENICSX: Mapping[str, Callable[[], Check]] = {
     "dolfinx": _dolfinx,
     "ufl": _ufl,

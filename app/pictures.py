@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -24,6 +25,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 ORGAN = "#c4604a"  # colour of a surface that is given none
+CLOUD, FOUND = "#1c6fd1", "#f08c00"
+_VESSELS = ("#3b5bdb", "#9c36b5", "#0c8599", "#5c940d")
+_TUMOUR = re.compile("tumou?r|lesion|metasta", re.IGNORECASE)
 DISPLACEMENT = "viridis"
 _SUPERSAMPLING = 2  # VTK counts points and lines in the pixels before they are averaged
 # In a process of its own: where VTK can draw nowhere, it ends the process that asks it to.
@@ -99,6 +103,18 @@ class View:
     up: Floats
     centre: Floats
     half: tuple[float, float]
+
+
+def is_tumour(name: str) -> bool:
+    """True for the name of what a surgeon looks for."""
+    return _TUMOUR.search(name) is not None
+
+
+def inner_colours(names: Iterable[str]) -> dict[str, str]:
+    """A colour for each inner surface: tumours stand out."""
+    names = list(names)
+    vessels = [name for name in names if not is_tumour(name)]
+    return {name: _VESSELS[vessels.index(name) % len(_VESSELS)] if name in vessels else FOUND for name in names}
 
 
 def view_of(towards: Floats, points: Iterable[Floats], margin: float = 1.06) -> View:

@@ -1,171 +1,298 @@
-"""Clouds to states of a twin: choose a forward model, register frame after frame, write what was found."""
+"""Clouds in files to states of a twin: read them, register frame after frame, write what was found."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
+import glob
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.clouds import check_cloud
-from softtwin.meshes.embedding import target_points
-from softtwin.meshes.files import read_body, read_cloud, write_deformed
-from softtwin.meshes.metrics import target_errors
-from softtwin.reference.loads import loaded_nodes
-from softtwin.registration.control import nodal_control
-from softtwin.registration.forward import ForwardModel
-from softtwin.registration.minimise import Registrar, Registration, RegistrationOptions
-from softtwin.registration.objective import CloudObjective
-from softtwin.registration.sequence import register_sequence
+from softtwin.meshes.clouds import CloudError
+from softtwin.meshes.export import Coordinates
+from softtwin.meshes.files import ContentError, FileError, Unit, read_cloud
+from softtwin.registration.pose import LandmarkFit, Pose, from_landmarks, read_landmarks, read_matrix
+from softtwin.registration.unknowns import PosePrior
 
-from .config import Config, ConfigError, RegistrationSection, read_config
-from .stages.generate import load_plan
+from . import twin as twins
+from .config import ConfigError
+from .export import WRITTEN, Exporter
+from .record import NOTICE as NOTICE
+from .record import Recorder, counts, describe, millimetres
+from .twin import Camera, Frame, Twin, coordinates_of
 
 Floats = NDArray[np.float64]
-NOTICE = "Research software: not a medical device."
+_CLOUDS = (".npy", ".txt", ".csv", ".xyz", ".ply", ".stl", ".obj", ".vtk", ".vtp", ".vtu", ".pcd")
 
 
-def open_twin(folder: Path | str) -> tuple[Body, Config]:
-    """The body and the configuration of a twin.
-
-    Raises:
-        ConfigError: the folder is no twin.
-    """
-    folder = Path(folder)
-    missing = [name for name in ("body.vtu", "organ.toml") if not (folder / name).is_file()]
-    if missing:
-        raise ConfigError(f"twin: expected a twin folder with {missing} in {folder}; make one with `softtwin build`.")
-    config, _ = read_config(folder / "organ.toml")
-    return read_body(folder / "body.vtu"), config
-
-
-@contextmanager
-def forward_model(name: str, folder: Path, body: Body, config: Config) -> Iterator[ForwardModel]:
-    """The forward model that registers: the twin's surrogate, or the reference where FEniCSx is installed.
+@dataclass(frozen=True)
+class CloudFile:
+    """A cloud that is read when its turn comes.
 
     Args:
-        name: `surrogate` or `reference`.
-        folder: the twin.
-        body: its body.
-        config: its configuration; gives the reference its material.
+        path: its file.
+        coordinates: unit and axes of the file.
     """
-    if name == "surrogate":
-        from softtwin.surrogate.predictor import load  # torch is needed here alone
 
-        yield load(folder, body)
-        return
-    from softtwin.reference.adjoint import ReferenceModel  # FEniCSx is needed here alone
-    from softtwin.reference.equilibrium import NewtonOptions, Problem
-    from softtwin.reference.materials import MATERIALS
+    path: Path
+    coordinates: Coordinates
 
-    material = MATERIALS[config.material.law](config.material.young_modulus, config.material.poisson_ratio)
-    with Problem(body, material, NewtonOptions(tolerance=1e-5, max_iterations=15)) as problem:
-        yield ReferenceModel(problem, patient=False)
+    def read(self) -> Floats:
+        """The points, (p, 3), metres.
 
-
-def make_registrar(model: ForwardModel, config: Config, section: RegistrationSection) -> Registrar:
-    """A registrar for a model, with the zone, noise and observed side of the configuration."""
-    body = model.body
-    if section.zone and section.zone not in body.node_sets:
-        raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {section.zone!r}.")
-    nodes = body.node_sets[section.zone] if section.zone else loaded_nodes(body, load_plan(config))
-    control = nodal_control(body, nodes, section.force_scale, section.smoothness)
-    options = RegistrationOptions(noise=section.noise, max_iterations=section.max_iterations)
-    return Registrar(model, CloudObjective(body, body.surfaces.get("observed")), control, options)
+        Raises:
+            FileError: the file is missing, damaged, or of no known kind.
+        """
+        return read_cloud(self.path, self.coordinates.unit, self.coordinates.axes)
 
 
-def read_clouds(paths: Sequence[Path], unit: str, body: Body) -> list[Floats]:
-    """The clouds of a sequence, each checked before the first is registered.
+def find_clouds(names: Sequence[Path | str], coordinates: Coordinates) -> list[CloudFile]:
+    """The clouds that files, folders and patterns name; those of a folder or a pattern in the order of their numbers.
+
+    Every file is read once, so that one that cannot be read is said before the first is registered; one that can be
+    but holds no points, or NaN, has its frame refused when its turn comes.
+
+    Args:
+        names: files, folders, or patterns such as `clouds/*.ply`.
+        coordinates: unit and axes of the files.
 
     Raises:
-        FileError, CloudError: which file cannot be used, and why.
+        FileError: nothing is there, or a file cannot be read.
     """
-    clouds = []
-    for path in paths:
-        cloud = read_cloud(path, unit)  # type: ignore[arg-type]
+    files = [CloudFile(path, coordinates) for name in names for path in _files_of(str(name))]
+    for file in tqdm(files, desc="reading", unit="cloud", disable=None if len(files) > 1 else True, leave=False):
         try:
-            clouds.append(check_cloud(cloud, body))
-        except ValueError as error:
-            raise type(error)(f"{path}: {error}") from None
-    return clouds
+            file.read()
+        except ContentError:
+            continue
+    return files
+
+
+def _files_of(name: str) -> list[Path]:
+    path = Path(name)
+    if path.is_file():
+        return [path]
+    if path.is_dir():
+        found = [file for file in path.iterdir() if file.suffix.lower() in _CLOUDS]
+        if not found:
+            raise FileError(f"{path}: expected clouds in this folder ({', '.join(_CLOUDS)}), found none.")
+    elif glob.has_magic(name):
+        found = [Path(file) for file in glob.glob(name, recursive=True) if Path(file).is_file()]
+        if not found:
+            raise FileError(f"{name}: expected a pattern of files, found none that matches.")
+    else:
+        raise FileError(f"{name}: expected a cloud, a folder of clouds or a pattern in quotes, found nothing there.")
+    return sorted(found, key=lambda file: _by_numbers(str(file)))
+
+
+def _by_numbers(name: str) -> list[tuple[int, str]]:
+    """A key by which cloud_2 comes before cloud_10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def read_truth(path: Path, frames: int, body: Body, coordinates: Coordinates) -> Floats:
+    """True node positions, (frames or more, n, 3), metres, on the inner axes.
+
+    Args:
+        path: .npy of shape (frames or more, n, 3), or (n, 3) for one frame, metres, on the axes of the twin's files.
+        frames: how many are wanted.
+        body: the body.
+        coordinates: of the twin's files.
+
+    Raises:
+        ConfigError: no such array, another shape, or numbers that are not finite.
+    """
+    nodes = len(body.points)
+    try:
+        positions = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+    except (ValueError, EOFError, OSError) as error:
+        raise ConfigError(f"--truth: expected an array of node positions in {path} ({error}).") from None
+    if positions.shape == (nodes, 3) and frames == 1:
+        positions = positions[None]
+    if positions.ndim != 3 or positions.shape[1:] != (nodes, 3) or len(positions) < frames:
+        one = f" or ({nodes}, 3)" if frames == 1 else ""
+        raise ConfigError(
+            f"--truth: expected shape ({frames} or more, {nodes}, 3){one}, got {positions.shape} in {path}."
+        )
+    if not np.isfinite(positions).all():
+        raise ConfigError(f"--truth: expected finite positions, got NaN or infinity in {path}.")
+    return coordinates.directions(positions)
+
+
+def camera_from_matrix(path: Path, coordinates: Coordinates) -> Pose:
+    """The pose in a file, between the inner axes of body and clouds.
+
+    Args:
+        path: as for `read_matrix`: it takes the body at rest to the camera.
+        coordinates: of the clouds; their unit is that of the translation. A `.tfm` says its own.
+
+    Raises:
+        FileError: see `read_matrix`.
+    """
+    pose = read_matrix(path, coordinates.unit)
+    return pose if path.suffix.lower() == ".tfm" else Pose.from_matrix(coordinates.motion(pose.matrix))
+
+
+def camera_from_landmarks(body: Path, camera: Path, inside: Coordinates, clouds: Coordinates) -> LandmarkFit:
+    """The pose that brings landmarks on the body to those that the camera sees.
+
+    Args:
+        body: file of the landmarks on the body at rest.
+        camera: file of those in the camera's coordinates.
+        inside: coordinates of the body's files.
+        clouds: of the clouds' files.
+
+    Raises:
+        FileError, PoseError: a file that cannot be read, too few landmarks in common, or all in one line.
+    """
+    return from_landmarks(_landmarks(body, inside), _landmarks(camera, clouds))
+
+
+def _landmarks(path: Path, coordinates: Coordinates) -> dict[str, Floats]:
+    turned = read_landmarks(path, coordinates.unit, "lps")
+    if path.suffix.lower() in (".fcsv", ".json"):
+        return turned  # these say their axes themselves
+    return {name: coordinates.directions(place) for name, place in turned.items()}
+
+
+def describe_landmarks(fit: LandmarkFit) -> str:
+    """One line for a person: how many landmarks were used and what is left at them."""
+    worst = max(fit.residuals, key=lambda name: fit.residuals[name])
+    line = f"landmarks: {len(fit.residuals)} used, {millimetres(fit.rms, 1)} left, most at {worst} "
+    line += f"({millimetres(fit.residuals[worst], 1)})"
+    return line + (f"; without a partner: {', '.join(fit.unmatched)}" if fit.unmatched else "")
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a person says that the camera stands; at most one of the three.
+
+    Args:
+        matrix: file of the pose.
+        landmarks: files of landmarks, on the body and in the camera's coordinates.
+        align: look for the pose in the clouds.
+    """
+
+    matrix: Path | None = None
+    landmarks: tuple[Path, Path] | None = None
+    align: bool = False
+
+
+def register_files(
+    place: Path,
+    names: Sequence[Path | str],
+    output: Path,
+    options: Mapping[str, Any],
+    *,
+    unit: Unit | None = None,
+    start: Start | None = None,
+    truth: Path | None = None,
+    formats: tuple[str, ...] = (),
+    say: Callable[[str], None] = print,
+) -> dict[str, int]:
+    """Register the clouds in files to the twin in a folder; returns how many frames bear each verdict.
+
+    Args:
+        place: the twin; see `find_twin`.
+        names: files, folders or patterns of clouds.
+        output: folder to write to.
+        options: entries of [registration] that replace the twin's.
+        unit: of the clouds; that of the twin's files if not given.
+        start: where the camera stands; in the body's coordinates if not given.
+        truth: file of true node positions.
+        formats: of the files of each frame; VTU and VTP if none.
+        say: prints a line.
+
+    Raises:
+        ConfigError, FileError, CloudError, PoseError, TwinError: what cannot be used, and why.
+    """
+    home = twins.find_twin(place)
+    inside = coordinates_of(twins.with_options(home.config, dict(options)))
+    outside = replace(inside, unit=unit or inside.unit)
+    clouds = find_clouds(names, outside)
+    positions = None if truth is None else read_truth(truth, len(clouds), home.body, inside)
+    start = start or Start()
+    pose = None
+    if start.matrix is not None:
+        pose = camera_from_matrix(start.matrix, outside)
+    if start.landmarks is not None:
+        fit = camera_from_landmarks(*start.landmarks, inside, outside)
+        say(describe_landmarks(fit))
+        pose = fit.pose
+    with home.twin(**options) as twin:
+        camera: Camera = "align" if start.align else camera_of(twin, pose)
+        chosen = formats or WRITTEN
+        rows = register_clouds(twin, clouds, output, camera=camera, truth=positions, formats=chosen, say=say)
+    return counts(rows)
+
+
+def camera_of(twin: Twin, pose: Pose | None) -> Pose | PosePrior | None:
+    """A start as the configuration wants it: known, or an unknown near it.
+
+    Args:
+        twin: the twin; `config.registration.pose` says which.
+        pose: the start; None where none was given: the camera's coordinates are the body's.
+    """
+    wanted = twin.config.registration.pose
+    if wanted == "unknown" or (wanted == "auto" and pose is not None):
+        return twin.near(pose or Pose.identity())
+    return pose
 
 
 def register_clouds(
-    registrar: Registrar,
-    clouds: Sequence[Floats],
+    twin: Twin,
+    clouds: Sequence[CloudFile | ArrayLike],
     output: Path,
+    *,
+    zone: str | None = None,
+    camera: Camera = None,
     truth: Floats | None = None,
+    formats: tuple[str, ...] = WRITTEN,
     say: Callable[[str], None] = print,
-) -> list[Registration]:
-    """Register a sequence and write each frame as it is found: a VTU of the deformed organ and a line of figures.
+) -> list[dict[str, Any]]:
+    """Register a sequence and write each frame as it is found; returns the figures of all frames.
 
     Args:
-        registrar: model, zone and options.
-        clouds: one a frame, (p, 3), metres.
+        twin: the twin.
+        clouds: one a frame: files, or points (p, 3) in metres.
         output: folder to write to.
+        zone: as for `Twin.register`.
+        camera: where the camera stands.
         truth: true node positions of each frame, (frames, n, 3), metres, to state errors.
+        formats: of the files of each frame.
         say: prints one line a frame.
+
+    Raises:
+        CloudError: none of the clouds could be registered at all; their frames are written all the same.
     """
-    output.mkdir(parents=True, exist_ok=True)
-    body = registrar.model.body
-    targets = target_points(body)
-    results, rows = [], []
-    frames = register_sequence(registrar, clouds)
-    for i, result in enumerate(tqdm(frames, total=len(clouds), desc="registering", unit="frame", disable=None)):
-        row = frame_figures(body, result, i, targets, None if truth is None else truth[i] - body.points)
-        write_deformed(output / f"frame_{i:04d}.vtu", body, result.displacement, {"force_N": result.forces})
-        rows.append(row)
-        (output / "registration.json").write_text(json.dumps({"notice": NOTICE, "frames": rows}, indent=1) + "\n")
-        say(describe(row))
-        results.append(result)
-    return results
+    sequence = twins.Sequence(twin, zone, camera)
+    with (
+        Recorder(Exporter(twin, output, formats), zone, truth) as recorder,
+        tqdm(total=len(clouds), desc="registering", unit="frame", disable=None) as bar,
+    ):
+        for cloud in clouds:
+            row = recorder.add(_registered(sequence, cloud), cloud.path.name if isinstance(cloud, CloudFile) else "")
+            with tqdm.external_write_mode():
+                say(describe(row))
+            bar.update()
+    if recorder.rows and all("outcome" not in row for row in recorder.rows):
+        first = recorder.rows[0]
+        name = f"{first['cloud']}: " if first["cloud"] else ""
+        raise CloudError(f"no cloud could be registered; the first: {name}{first['reasons'][0]}")
+    return recorder.rows
 
 
-def frame_figures(
-    body: Body, result: Registration, frame: int, targets: dict[str, Any], truth: Floats | None
-) -> dict[str, Any]:
-    """What is known of a registered frame: movement of the inner surfaces, net force, doubt; errors with truth."""
-    row: dict[str, Any] = {
-        "frame": frame,
-        "rms_distance_m": result.rms_distance,
-        "net_force_N": result.net_force.tolist(),
-        "net_force_deviation_N": result.net_force_deviation.tolist(),
-        "largest_displacement_m": float(np.linalg.norm(result.displacement, axis=1).max()),
-        "seconds": result.seconds,
-        "iterations": len(result.trace),
-        "reason": result.reason,
-        "targets": {
-            name: {"movement_m": _mean_length(points.displace(result.displacement))} for name, points in targets.items()
-        },
-    }
-    if truth is not None:
-        row["error"] = asdict(target_errors(body.points + result.displacement, body.points + truth))
-        for name, points in targets.items():
-            moved, true = points.displace(result.displacement), points.displace(truth)
-            row["targets"][name]["error_m"] = _mean_length(moved - true)
-    return row
-
-
-def _mean_length(vectors: Floats) -> float:
-    return float(np.linalg.norm(vectors, axis=1).mean())
-
-
-def describe(row: dict[str, Any]) -> str:
-    """One line for a person: distance, net force with its doubt, time, and errors where the truth is known."""
-    force, doubt = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
-    line = (
-        f"frame {row['frame']:3d}: cloud to surface {1e3 * row['rms_distance_m']:.2f} mm, "
-        f"net force {force:.3f} ± {doubt:.3f} N, {1e3 * row['seconds']:.0f} ms"
-    )
-    if "error" in row:
-        line += f", error {1e3 * row['error']['mean']:.2f} mm"
-    for name, target in row["targets"].items():
-        line += f", {name} moved {1e3 * target['movement_m']:.1f} mm"
-    return line
+def _registered(sequence: twins.Sequence, cloud: CloudFile | ArrayLike) -> Frame:
+    if not isinstance(cloud, CloudFile):
+        return sequence.register(cloud)
+    try:
+        points = cloud.read()
+    except FileError as error:  # it could be read a moment ago, or holds nothing to register
+        return sequence.refuse(str(error))
+    return sequence.register(points)

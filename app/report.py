@@ -6,7 +6,7 @@ import json
 import platform
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path, PurePath
@@ -24,22 +24,36 @@ from softtwin.meshes.embedding import Embedding, carried, target_points
 from softtwin.meshes.files import read_body
 from softtwin.meshes.metrics import mesh_quality, nodal_errors
 from softtwin.reference.dataset import SPLITS, DataSet
-from softtwin.registration.objective import CloudObjective
+from softtwin.registration.residuals import SurfaceDistance
 
 from .config import Config, to_toml
-from .pictures import DISPLACEMENT, ORGAN, Layer, Picture, Studio, camera_side, chart, rendering_problem, view_of
-from .register import NOTICE
-from .workspace import Workspace
+from .pictures import (
+    CLOUD,
+    DISPLACEMENT,
+    FOUND,
+    ORGAN,
+    Layer,
+    Picture,
+    Studio,
+    camera_side,
+    chart,
+    inner_colours,
+    is_tumour,
+    rendering_problem,
+    view_of,
+)
+from .record import NOTICE
+from .sequences import find_registrations, sequence_section
+from .workspace import Workspace, read_records
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Section = dict[str, Any]
 
-OBSERVED, FIXED, CLOUD, TRUTH, FOUND = "#1c6fd1", "#d9480f", "#1c6fd1", "#2f9e44", "#f08c00"
-_VESSELS = ("#3b5bdb", "#9c36b5", "#0c8599", "#5c940d")
-_TUMOUR = re.compile("tumou?r|lesion|metasta", re.IGNORECASE)
+OBSERVED, FIXED, TRUTH = "#1c6fd1", "#d9480f", "#2f9e44"
 _ERROR = "YlOrRd"
 _MODES = 6
+_DEMOS = ("surrogate", "surrogate-without-zone", "reference")
 _MODE_SIZE = 0.12  # largest displacement of a mode in its picture, relative to the body
 _MOST_DRAWS = 1024  # of each split that the histograms look at
 _READ_ERRORS = (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile)
@@ -49,13 +63,14 @@ class _Missing(Exception):  # noqa: N818 - not an error: a section whose stage h
     """An input that is not there yet, and the command that makes it."""
 
 
-def report_stage(space: Workspace) -> Path:
+def report_stage(space: Workspace, registrations: Sequence[Path] = ()) -> Path:
     """Write report.html into the workspace's folder: one file that needs nothing else, in light, dark and print.
 
     A section whose input is not there yet, or cannot be read, says so and names the command that makes it.
 
     Args:
         space: the workspace.
+        registrations: folders that `softtwin register` wrote, beside those that lie in the workspace's folder.
 
     Returns:
         The file written.
@@ -64,9 +79,26 @@ def report_stage(space: Workspace) -> Path:
     pyvista.OFF_SCREEN = True
     studio = Studio(rendering_problem())
     sections = {name: _guarded(make, space, studio) for name, make in _SECTIONS.items()}
+    folders = find_registrations(space.folder, registrations)
+    sections["sequences"] = _guarded(lambda space, studio: _sequences(space, studio, folders), space, studio)
     path = space.folder / "report.html"
     path.write_text(_fill_template(space, studio, sections), encoding="utf-8")
     return path
+
+
+def _sequences(space: Workspace, studio: Studio, folders: Sequence[Path]) -> Section:
+    if not folders:
+        raise _Missing(
+            "There are no registrations of your own: softtwin register TWIN CLOUDS... makes them; "
+            "softtwin report organ.toml --registrations FOLDER shows them."
+        )
+    body = _body(space)
+
+    def section(folder: Path) -> Section:
+        made = _guarded(lambda space, studio: sequence_section(folder, body, studio), space, studio)
+        return {"name": folder.resolve().name, **made}
+
+    return {"every": [section(folder) for folder in folders]}
 
 
 def _guarded(make: Callable[[Workspace, Studio], Section], space: Workspace, studio: Studio) -> Section:
@@ -82,7 +114,9 @@ def _fill_template(space: Workspace, studio: Studio, sections: Mapping[str, Sect
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters.update(figure=figure, mm=lambda metres: figure(1e3 * metres), vector=_vector)
+    environment.filters.update(
+        figure=figure, mm=lambda metres: "–" if metres is None else figure(1e3 * metres), vector=_vector
+    )
     environment.globals.update(gradient=_gradient, norm=np.linalg.norm)
     environment.globals.update(displacement_colours=DISPLACEMENT, error_colours=_ERROR)
     template = environment.from_string(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
@@ -115,13 +149,6 @@ def _gradient(colours: str) -> str:
 
 
 # ------------------------------------------------------------------ the organ
-
-
-def inner_colours(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each inner surface: tumours stand out."""
-    names = list(names)
-    vessels = [name for name in names if not _TUMOUR.search(name)]
-    return {name: _VESSELS[vessels.index(name) % len(_VESSELS)] if name in vessels else FOUND for name in names}
 
 
 def _body(space: Workspace) -> Body:
@@ -323,7 +350,7 @@ class _State:
     """Where the organ is taken to be: before registration, or as a model found it.
 
     Args:
-        name: `before`, `surrogate` or `reference`.
+        name: `before`, or of a registration of the demo.
         displacement: (n, 3), metres.
         forces: (n, 3), newtons; none before registration.
         row: what registration.json says of it.
@@ -346,11 +373,11 @@ def registration_section(space: Workspace, studio: Studio) -> Section:
     body = _body(space)
     cloud = np.load(folder / "cloud.npy")
     truth = _fields(body, "truth.npy", np.load(folder / "truth.npy")[None])[0]
-    models = [name for name in ("surrogate", "reference") if (folder / f"{name}.npz").exists()]
-    found = [_read_state(folder, name, body) for name in models]
+    made = [name for name in _DEMOS if (folder / f"{name}.npz").exists()]
+    found = [_read_state(folder, name, body) for name in made]
     states = [_State("before", np.zeros_like(truth), None, {}), *found]
     targets = target_points(body)
-    shown = [name for name in targets if _TUMOUR.search(name)] or list(targets)
+    shown = [name for name in targets if is_tumour(name)] or list(targets)
     rows = [_figures(body, state, truth, cloud, targets) for state in states]
     return {
         "points": len(cloud),
@@ -384,7 +411,7 @@ def _true_force(folder: Path, found: Sequence[_State]) -> Floats | None:
 def _figures(body: Body, state: _State, truth: Floats, cloud: Floats, targets: Mapping[str, Embedding]) -> Section:
     force = None if state.forces is None else state.forces.sum(axis=0)
     return {
-        "name": state.name,
+        "name": state.name.replace("-", " "),
         "nodes": nodal_errors(state.displacement, truth),
         "targets": _apart(targets, state.displacement, truth),
         "distance": _cloud_distance(body, state.displacement, cloud),
@@ -392,7 +419,9 @@ def _figures(body: Body, state: _State, truth: Floats, cloud: Floats, targets: M
         "deviation": state.row.get("net_force_deviation_N"),
         "seconds": state.row.get("seconds"),
         "iterations": state.row.get("iterations"),
-        "reason": state.row.get("reason", ""),
+        "outcome": str(state.row.get("outcome", "")).replace("_", " "),
+        "verdict": state.row.get("verdict", ""),
+        "reasons": state.row.get("reasons", []),
     }
 
 
@@ -403,8 +432,8 @@ def _apart(targets: Mapping[str, Embedding], first: Floats, second: Floats) -> d
 
 def _cloud_distance(body: Body, displacement: Floats, cloud: Floats) -> float:
     """Root mean square distance of the cloud to the observed side, metres."""
-    objective = CloudObjective(body, body.surfaces.get("observed"))
-    return float(np.sqrt(np.mean(objective.match(displacement[objective.nodes], cloud).distances ** 2)))
+    observed = SurfaceDistance(body, body.surfaces.get("observed"))
+    return observed.match(displacement[observed.nodes], cloud).rms
 
 
 def _wide_pictures(
@@ -449,14 +478,15 @@ def _closeups(
 
 
 def _state_words(state: _State) -> str:
-    return "before" if state.name == "before" else f"after, with the {state.name}"
+    return "before" if state.name == "before" else f"after, with the {state.name.replace('-', ' ')}"
 
 
 def _compared(found: Sequence[_State], targets: Mapping[str, Embedding]) -> Section | None:
     """How far the two models' registrations lie apart, None unless both are there."""
-    if len(found) < 2:
+    named = {state.name: state for state in found}
+    if not {"surrogate", "reference"} <= set(named):
         return None
-    first, second = found
+    first, second = named["surrogate"], named["reference"]
     return {
         "nodes": nodal_errors(first.displacement, second.displacement),
         "targets": _apart(targets, first.displacement, second.displacement),
@@ -469,8 +499,7 @@ def _compared(found: Sequence[_State], targets: Mapping[str, Embedding]) -> Sect
 
 def record_section(space: Workspace, studio: Studio) -> Section:
     """What it takes to make the same again: configuration, versions, times, the twin's card."""
-    times, card = space.folder / "stages.json", space.twin / "surrogate.json"
-    stages = json.loads(times.read_text()) if times.exists() else {}
+    stages, card = read_records(space.folder), space.twin / "surrogate.json"
     return {
         "stages": stages,
         "total": sum(stage["seconds"] for stage in stages.values()),

@@ -1,15 +1,19 @@
-"""Where everything of one twin lies, and how long its stages took."""
+"""Where everything of one twin lies, and the record of its stages: what each one read, and how long it took."""
 
 from __future__ import annotations
 
 import json
+import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from .config import Config, read_config
+
+RECORDS = "stages.json"
 
 
 @dataclass(frozen=True)
@@ -61,11 +65,64 @@ def open_workspace(path: Path | str) -> Workspace:
 
 
 @contextmanager
-def timed(space: Workspace, stage: str) -> Iterator[None]:
-    """Record how long a stage took, beside its results."""
+def timed(space: Workspace, stage: str, read: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """Record a stage beside its results: what it read and how long it took.
+
+    The record goes before the stage begins: one that is cut short leaves none, and results without one answer for
+    nothing.
+
+    Args:
+        space: the workspace.
+        stage: its name.
+        read: what it reads, as from `softtwin.app.inputs`; hashed before the stage begins.
+    """
+    records = read_records(space.folder)
+    if records.pop(stage, None) is not None:
+        _write_records(space.folder, records)
     begin = time.perf_counter()
     yield
-    path = space.folder / "stages.json"
-    stages = json.loads(path.read_text()) if path.exists() else {}
-    stages[stage] = {"seconds": round(time.perf_counter() - begin, 2), "finished": time.strftime("%Y-%m-%d %H:%M:%S")}
-    path.write_text(json.dumps(stages, indent=1) + "\n")
+    record_stage(space, stage, time.perf_counter() - begin, read)
+
+
+def record_stage(space: Workspace, stage: str, seconds: float, read: Mapping[str, Any] | None = None) -> None:
+    """Write the record of a stage that has succeeded.
+
+    Args:
+        space: the workspace.
+        stage: its name.
+        seconds: how long it took.
+        read: what it read.
+    """
+    entry = {"seconds": round(seconds, 2), "finished": time.strftime("%Y-%m-%d %H:%M:%S"), "read": dict(read or {})}
+    _write_records(space.folder, {**read_records(space.folder), stage: entry})
+
+
+def read_records(folder: Path) -> dict[str, dict[str, Any]]:
+    """The records of the stages of a folder; one that is damaged counts as none.
+
+    Returns:
+        Name of the stage: `seconds`, `finished` and `read`, a mapping from what was read to its value or hash.
+    """
+    try:
+        found = json.loads((folder / RECORDS).read_text())
+    except (OSError, ValueError):
+        return {}
+    entries = found.items() if isinstance(found, dict) else ()
+    return {name: entry for name, entry in entries if _is_record(entry)}
+
+
+def write_whole(path: Path, content: str) -> None:
+    """Write a text whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(content)
+    os.replace(partial, path)
+
+
+def _is_record(entry: Any) -> bool:
+    if not isinstance(entry, dict) or not isinstance(entry.get("read", {}), dict):
+        return False
+    return isinstance(entry.get("seconds"), int | float)
+
+
+def _write_records(folder: Path, records: Mapping[str, Any]) -> None:
+    write_whole(folder / RECORDS, json.dumps(records, indent=1) + "\n")

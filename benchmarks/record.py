@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from softtwin.app.doctor import available_cores
+
 RESULTS = Path(__file__).parent / "results"
 LIVER = Path(__file__).parents[2] / "shared" / "data" / "liver"
 
@@ -25,7 +27,7 @@ def machine() -> dict[str, Any]:
     names = ("numpy", "scipy", "torch", "vtk", "zarr", "fenics-dolfinx", "petsc4py", "slepc4py")
     return {
         "processor": model,
-        "cores": os.cpu_count(),
+        "cores": available_cores(),
         "load_at_the_end": os.getloadavg()[0],
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in names},

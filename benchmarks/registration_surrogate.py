@@ -21,7 +21,7 @@ from softtwin.app.launch import generate_in_parallel
 from softtwin.app.stages.learn import train_stage, validate_stage
 from softtwin.app.workspace import Workspace
 from softtwin.meshes.files import write_body
-from softtwin.registration.minimise import RegistrationOptions
+from softtwin.registration.registrar import RegistrationOptions
 
 RUNS = Path(__file__).parent / "runs"
 
@@ -57,7 +57,6 @@ def main() -> None:
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--frames", type=int, default=50)
-    parser.add_argument("--noise", type=float, default=1e-3)
     parser.add_argument("--smoothness", type=float, default=0.02)
     parser.add_argument("--folder", type=Path, default=RUNS / "liver")
     parser.add_argument("--twin", type=Path, help="register with this finished twin instead of making one")
@@ -65,9 +64,9 @@ def main() -> None:
     twin = arguments.twin or make_twin(arguments.seconds, arguments.ranks, arguments.folder).twin
     body = liver()
     model = load(twin, body)
-    figures = {"noise": arguments.noise, "smoothness": arguments.smoothness, "sequences": {}}
+    figures = {"smoothness": arguments.smoothness, "sequences": {}}
     figures["held_out"] = model.card.get("held_out")
-    options = RegistrationOptions(noise=arguments.noise)
+    options = RegistrationOptions()
     with threadpool_limits(1):
         for name in SEQUENCES:
             rows = run(sequence(name), model, arguments.frames, options, arguments.smoothness)

@@ -1,15 +1,18 @@
-"""Closest points of triangle surfaces, by VTK's static cell locator."""
+"""Closest points of triangle surfaces, at rest and while their vertices move, by VTK's static cell locator."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
 from vtkmodules.vtkCommonCore import mutable, vtkPoints
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData, vtkStaticCellLocator
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkGenericCell, vtkPolyData, vtkStaticCellLocator
 
 from .body import Floats, Ints, Surface
+
+_LONGEST_WALK = 60  # triangles that a point may cross
 
 
 def polydata(surface: Surface) -> vtkPolyData:
@@ -68,3 +71,130 @@ def distances(surface: Surface, points: Floats) -> Floats:
         points: positions, (p, 3), metres.
     """
     return np.linalg.norm(points - closest_points(surface, points)[0], axis=1)
+
+
+class ClosestPoints:
+    """Closest points on the triangles of a surface, wherever its vertices are, whole clouds at a time.
+
+    Args:
+        triangles: vertex numbers, (t, 3).
+        vertices: number of vertices.
+    """
+
+    def __init__(self, triangles: Ints, vertices: int) -> None:
+        self.triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+        self._ring = _rings(self.triangles, vertices)
+        self._points, cells = vtkPoints(), vtkCellArray()
+        self._points.SetDataTypeToDouble()
+        self._points.SetNumberOfPoints(vertices)
+        offsets: Ints = np.arange(0, self.triangles.size + 1, 3)
+        cells.SetData(
+            numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(self.triangles.ravel(), deep=True)
+        )
+        self._surface = vtkPolyData()
+        self._surface.SetPoints(self._points)
+        self._surface.SetPolys(cells)
+
+    def find(self, positions: Floats, cloud: Floats) -> tuple[Ints, Floats]:
+        """Triangle, (p,), and barycentric weights, (p, 3), of the closest point on the surface for each of a cloud.
+
+        Args:
+            positions: where the vertices are now, (n, 3), metres.
+            cloud: points, (p, 3), metres.
+        """
+        self._points.SetData(numpy_to_vtk(np.ascontiguousarray(positions), deep=True))
+        self._points.Modified()
+        locator = vtkStaticCellLocator()
+        locator.SetDataSet(self._surface)
+        locator.BuildLocator()
+        cell = vtkGenericCell()
+        number: Any = mutable(0)  # VTK writes its answers into these
+        part: Any = mutable(0)
+        squared: Any = mutable(0.0)
+        place = [0.0, 0.0, 0.0]
+        found = np.empty(len(cloud), dtype=np.int64)
+        for i, point in enumerate(cloud.tolist()):
+            locator.FindClosestPoint(point, place, cell, number, part, squared)
+            found[i] = number.get()
+        return found, closest_in_triangles(positions[self.triangles[found]], cloud)[0]
+
+    def follow(self, positions: Floats, cloud: Floats, near: Ints) -> tuple[Ints, Floats]:
+        """The same by walking from triangle to triangle: a local minimum of the distance, found in a tenth of the time.
+
+        Args:
+            positions: where the vertices are now, (n, 3), metres.
+            cloud: points, (p, 3), metres.
+            near: triangles to start from, (p,).
+        """
+        found = near.copy()
+        weights, _ = closest_in_triangles(positions[self.triangles[found]], cloud)
+        moving = np.flatnonzero((weights <= 0.0).any(axis=1))
+        for _ in range(_LONGEST_WALK):
+            if not len(moving):
+                break
+            ring = self._ring[found[moving]]  # (m, r)
+            corners = positions[self.triangles[ring.ravel()]]
+            tried, squares = closest_in_triangles(corners, np.repeat(cloud[moving], ring.shape[1], axis=0))
+            best = squares.reshape(ring.shape).argmin(axis=1)
+            rows = np.arange(len(moving))
+            chosen = ring[rows, best]
+            changed = chosen != found[moving]
+            found[moving] = chosen
+            weights[moving] = tried.reshape(*ring.shape, 3)[rows, best]
+            moving = moving[changed]
+        return found, weights
+
+
+def _rings(triangles: Ints, vertices: int) -> Ints:
+    """Numbers of the triangles that share a vertex with each triangle, itself first, repeated to one length, (t, r)."""
+    count = len(triangles)
+    incidence = csr_array(
+        (np.ones(triangles.size, dtype=np.int64), triangles.ravel(), np.arange(0, triangles.size + 1, 3)),
+        shape=(count, vertices),
+    )
+    touching = (incidence @ incidence.T).tocsr()
+    longest = int(np.diff(touching.indptr).max(initial=1))
+    rings = np.repeat(np.arange(count)[:, None], longest, axis=1)
+    for i in range(count):
+        beside = touching.indices[touching.indptr[i] : touching.indptr[i + 1]]
+        rings[i, 1 : len(beside)] = beside[beside != i]
+    return rings
+
+
+def closest_in_triangles(corners: Floats, points: Floats) -> tuple[Floats, Floats]:
+    """Barycentric weights (p, 3) of the point of each triangle (p, 3, 3) closest to a point (p, 3), squared distance.
+
+    The unconstrained minimum where it is inside, else the best of the three edges.
+    """
+    a = corners[:, 0]
+    e, f, g = corners[:, 1] - a, corners[:, 2] - a, points - a
+    ee, ef, ff = _dot(e, e), _dot(e, f), _dot(f, f)
+    ge, gf, gg = _dot(g, e), _dot(g, f), _dot(g, g)
+    tiny = 1e-300
+    size = np.maximum(ee * ff - ef * ef, tiny)
+    v, w = (ff * ge - ef * gf) / size, (ee * gf - ef * ge) / size
+    outside = (v < 0.0) | (w < 0.0) | (v + w > 1.0)
+    on_e = np.clip(ge / np.maximum(ee, tiny), 0.0, 1.0)
+    on_f = np.clip(gf / np.maximum(ff, tiny), 0.0, 1.0)
+    # Along the edge from b to c: b + t (c - b).
+    opposite = np.maximum(ee - 2.0 * ef + ff, tiny)
+    on_g = np.clip((gf - ge - ef + ee) / opposite, 0.0, 1.0)
+    zero = np.zeros_like(v)
+    choices_v = np.stack([on_e, zero, 1.0 - on_g])
+    choices_w = np.stack([zero, on_f, on_g])
+    squares = _square(choices_v, choices_w, ee, ef, ff, ge, gf, gg)
+    best = squares.argmin(axis=0)
+    rows = np.arange(len(points))
+    v = np.where(outside, choices_v[best, rows], v)
+    w = np.where(outside, choices_w[best, rows], w)
+    return np.stack([1.0 - v - w, v, w], axis=1), np.maximum(_square(v, w, ee, ef, ff, ge, gf, gg), 0.0)
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.einsum("pi,pi->p", a, b)
+
+
+def _square(v: Floats, w: Floats, ee: Floats, ef: Floats, ff: Floats, ge: Floats, gf: Floats, gg: Floats) -> Floats:
+    """|g - v e - w f|^2."""
+    found: Floats = gg + v * (v * ee - 2.0 * ge) + w * (w * ff - 2.0 * gf) + 2.0 * v * w * ef
+    return found

@@ -53,6 +53,10 @@ class FileError(ValueError):
     """A file that cannot be used: the message names it, what was expected and what came."""
 
 
+class ContentError(FileError):
+    """A file that is there and was read, but holds no points, or numbers that are not finite."""
+
+
 class UnitWarning(UserWarning):
     """A file whose size fits no organ: it was probably read in the wrong unit."""
 
@@ -163,11 +167,11 @@ def read_cloud(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Float
     if points.ndim != 2 or points.shape[1] != 3:
         raise FileError(f"{path}: expected a cloud of shape (p, 3), got {points.shape}.")
     if len(points) == 0:
-        raise FileError(f"{path}: expected a cloud with points, got none.")
+        raise ContentError(f"{path}: expected a cloud with points, got none.")
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points).all(axis=1)).sum())
-        raise FileError(f"{path}: expected finite coordinates, got NaN or infinity in {bad} of {len(points)} points; "
-                        "remove them.")  # fmt: skip
+        raise ContentError(f"{path}: expected finite coordinates, got NaN or infinity in {bad} of {len(points)}; "
+                           "remove them.")  # fmt: skip
     return _placed(path, points, unit, axes, smallest=0.0)
 
 
@@ -282,7 +286,7 @@ def _existing(path: str | Path) -> Path:
     if not path.is_file():
         raise FileError(f"{path}: no such file." if not path.exists() else f"{path}: expected a file, got a folder.")
     if path.stat().st_size == 0:
-        raise FileError(f"{path}: the file is empty.")
+        raise ContentError(f"{path}: the file is empty.")
     return path
 
 
@@ -303,9 +307,9 @@ def _read(path: str | Path) -> _Mesh:
         known = ", ".join((*_MESHIO, ".ply", *_VTK))
         raise FileError(f"{path}: expected a mesh file ({known}), got suffix {suffix!r}.")
     if len(mesh.points) == 0:
-        raise FileError(f"{path}: the file holds no points; it may be truncated or damaged.")
+        raise ContentError(f"{path}: the file holds no points; it may be truncated or damaged.")
     if not np.isfinite(mesh.points).all():
-        raise FileError(f"{path}: expected finite coordinates, got NaN or infinity.")
+        raise ContentError(f"{path}: expected finite coordinates, got NaN or infinity.")
     for name, block in mesh.cells.items():
         if block.min(initial=0) < 0 or block.max(initial=0) >= len(mesh.points):
             raise FileError(f"{path}: a {name} refers to a point that is not there; the file may be damaged.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import zlib
 from collections.abc import Mapping
@@ -108,39 +109,44 @@ class DataSet:
     @cached_property
     def body(self) -> Body:
         """The body that all samples belong to."""
-        group = self._root["body"]
         names = self.header["body"]
         body = Body(
-            points=group["points"][:],
-            cells=group["cells"][:],
-            node_sets={name: group[f"sets/{name}"][:] for name in names["sets"]},
-            surfaces={name: group[f"surfaces/{name}"][:] for name in names["surfaces"]},
+            points=self._array("body/points"),
+            cells=self._array("body/cells"),
+            node_sets={name: self._array(f"body/sets/{name}") for name in names["sets"]},
+            surfaces={name: self._array(f"body/surfaces/{name}") for name in names["surfaces"]},
             inner={
-                name: Surface(group[f"inner/{name}/points"][:], group[f"inner/{name}/triangles"][:])
+                name: Surface(self._array(f"body/inner/{name}/points"), self._array(f"body/inner/{name}/triangles"))
                 for name in names["inner"]
             },
         )
         if body.fingerprint != names["fingerprint"]:
             raise DataSetError(
-                f"DataSet: the body in {self.path} differs from the one it was made with; is it damaged?"
+                f"DataSet: the body in {self.path} differs from the one it was made with: {_BEYOND_REPAIR}"
             )
         return body
 
     @cached_property
     def response(self) -> LinearResponse:
         """The linear response that surrogates add their correction to."""
-        group = self._root["response"]
-        return LinearResponse(group["loaded"][:], group["left"][:], group["right"][:])
+        return LinearResponse(*(self._array(f"response/{name}") for name in ("loaded", "left", "right")))
 
     @cached_property
     def shapes(self) -> Floats:
         """Mode shapes, (k, n, 3)."""
-        return self._root["modes/shapes"][:]
+        return self._array("modes/shapes")
 
     @cached_property
     def eigenvalues(self) -> Floats:
         """Eigenvalues of the modes, (k,), N/m."""
-        return self._root["modes/eigenvalues"][:]
+        return self._array("modes/eigenvalues")
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 of the header and of the checksums of all blocks: another one, other samples."""
+        digest = hashlib.sha256(json.dumps(self.header, sort_keys=True).encode())
+        digest.update(np.asarray(self._checksums(), dtype=np.int64).tobytes())
+        return digest.hexdigest()
 
     @property
     def block_count(self) -> int:
@@ -149,7 +155,13 @@ class DataSet:
 
     def missing_blocks(self) -> list[int]:
         """Numbers of the blocks that are still to be made."""
-        return np.flatnonzero(self._root["samples/checksum"][:] == 0).tolist()
+        return np.flatnonzero(np.asarray(self._checksums()) == 0).tolist()
+
+    def damaged_blocks(self) -> dict[int, str]:
+        """Numbers of the blocks that are there but not as they were written, and what is wrong with each; reads all."""
+        stored = self._checksums()
+        found = {block: self._damage(block, stored[block]) for block in range(len(stored)) if stored[block] != 0}
+        return {block: damage for block, damage in found.items() if damage}
 
     def split_draws(self, split: Split) -> range:
         """Numbers of the draws of a split; splits share no block."""
@@ -200,26 +212,60 @@ class DataSet:
 
     def _check_blocks(self, draws: range) -> None:
         size = self.header["block"]
-        group = self._root["samples"]
-        stored = group["checksum"][:]
+        stored = self._checksums()
         for block in range(draws.start // size, -(-draws.stop // size)):
             if stored[block] == 0:
                 raise DataSetError(
                     f"DataSet: block {block} of {len(stored)} in {self.path} was never finished; "
                     "run `softtwin generate` again with the same configuration, it goes on where it stopped."
                 )
-            part = slice(block * size, (block + 1) * size)
-            try:
-                arrays = {name: group[name][part] for name in _BLOCK_ARRAYS}
-            except Exception as error:  # a damaged chunk fails in whichever codec reads it
-                raise DataSetError(f"DataSet: block {block} in {self.path} is damaged ({error}).") from error
-            if checksum(arrays) != stored[block]:
+            damage = self._damage(block, stored[block])
+            if damage:
                 raise DataSetError(
-                    f"DataSet: block {block} in {self.path} does not match its checksum: truncated or changed. "
-                    f"Delete it with `softtwin generate --redo {block}` and it is made again."
+                    f"DataSet: block {block} in {self.path} {damage}. Run `softtwin generate` again with the same "
+                    "configuration: it makes damaged blocks again."
                 )
 
+    def _damage(self, block: int, stored: int) -> str:
+        """What is wrong with a block, empty for nothing."""
+        size, group = self.header["block"], self._root["samples"]
+        part = slice(block * size, (block + 1) * size)
+        try:
+            arrays = {name: group[name][part] for name in _BLOCK_ARRAYS}
+        except Exception as error:  # a damaged chunk fails in whichever codec reads it
+            return f"is damaged ({type(error).__name__})"
+        return "" if checksum(arrays) == stored else "does not match its checksum: truncated or changed"
 
+    def _checksums(self) -> list[int]:
+        """Of all blocks; one that cannot be read is 0, as of a block that is not there."""
+        array = self._root["samples/checksum"]
+        try:
+            return array[:].tolist()
+        except Exception:  # one damaged chunk of many: find which
+            return [self._checksum(array, block) for block in range(array.shape[0])]
+
+    @staticmethod
+    def _checksum(array: Any, block: int) -> int:
+        try:
+            return int(array[block])
+        except Exception:  # in whichever codec reads it
+            return 0
+
+    def _array(self, name: str) -> Any:
+        """An array that is no block's, checked against its checksum where the data set has one."""
+        try:
+            values = self._root[name][:]
+        except Exception as error:  # a damaged chunk fails in whichever codec reads it
+            raise DataSetError(f"DataSet: {name} in {self.path} cannot be read: {_BEYOND_REPAIR}") from error
+        stored = self.header.get("checksums", {}).get(name)
+        if stored is not None and zlib.crc32(values.tobytes()) != stored:
+            raise DataSetError(f"DataSet: {name} in {self.path} does not match its checksum: {_BEYOND_REPAIR}")
+        return values
+
+
+_BEYOND_REPAIR = (
+    "truncated or changed. Bring a copy back, or make the whole data set again (`softtwin generate --again`)."
+)
 _BLOCK_ARRAYS = (
     "forces",
     "displacements",
@@ -269,11 +315,13 @@ def create(
         arrays |= {f"body/inner/{name}/points": surface.points, f"body/inner/{name}/triangles": surface.triangles}
     arrays |= {"response/loaded": response.loaded, "response/left": response.left, "response/right": response.right}
     arrays |= {"modes/shapes": shapes, "modes/eigenvalues": eigenvalues}
+    arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
     for name, values in arrays.items():
-        root.create_array(name, data=np.ascontiguousarray(values))
+        root.create_array(name, data=values)
+    checksums = {name: zlib.crc32(values.tobytes()) for name, values in arrays.items()}
     _create_samples(root, header, len(response.loaded), len(body.points), len(shapes))
     # The header comes last: a data set without one was never finished being made.
-    root.attrs["header"] = json.dumps({**header, "format": FORMAT, "body": names})
+    root.attrs["header"] = json.dumps({**header, "format": FORMAT, "body": names, "checksums": checksums})
     return DataSet(path)
 
 
@@ -316,5 +364,63 @@ def write_block(path: Path, block: int, arrays: Mapping[str, NDArray[Any]]) -> N
 
 
 def drop_block(path: Path, block: int) -> None:
-    """Mark a block as missing, so that it is made again."""
+    """Mark a block as missing, so that it is made again.
+
+    Raises:
+        DataSetError: no data set there, or none of its blocks has this number.
+    """
+    count = DataSet(path).block_count
+    if not 0 <= block < count:
+        raise DataSetError(f"drop_block.block: expected a number in 0..{count - 1}, got {block}.")
     zarr.open_group(str(path), mode="r+")["samples/checksum"][block] = 0
+
+
+def differences(data: DataSet, body: Body, plan: Mapping[str, Any]) -> list[str]:
+    """What keeps a data set from being one of a body and a plan: a few words each, none where it is.
+
+    Args:
+        data: the data set.
+        body: the body.
+        plan: entries of the plan, as in the header; those that are not given are not compared.
+    """
+    found = []
+    if data.body.fingerprint != body.fingerprint:
+        found.append(f"the body ({_described(data.body)} there, {_described(body)} here)")
+    else:
+        sets = data.body.node_sets, body.node_sets
+        zones = plan.get("loads", {}).get("zones", ())
+        found += [f"the zone {name!r}" for name in zones if not _same_nodes(*(nodes.get(name) for nodes in sets))]
+    return found + _plan_differences(data.header["plan"], plan)
+
+
+def existing(path: Path) -> DataSet | None:
+    """The data set in a folder; None where there is none, or one that was interrupted before its header was written.
+
+    Raises:
+        DataSetError: it cannot be read, though blocks of it were solved.
+    """
+    try:
+        return DataSet(path)
+    except DataSetError:
+        if any((path / "samples" / "checksum").glob("c/*")):
+            raise
+        return None
+
+
+def _described(body: Body) -> str:
+    return f"{len(body.points)} nodes, fingerprint {body.fingerprint[:12]}"
+
+
+def _same_nodes(one: Ints | None, other: Ints | None) -> bool:
+    return one is not None and other is not None and np.array_equal(np.unique(one), np.unique(other))
+
+
+def _plan_differences(stored: Mapping[str, Any], wanted: Mapping[str, Any], prefix: str = "") -> list[str]:
+    found: list[str] = []
+    for name, value in wanted.items():
+        present = stored.get(name)
+        if isinstance(value, Mapping) and isinstance(present, Mapping):
+            found += _plan_differences(present, value, f"{prefix}{name}.")
+        elif name not in stored or present != value:
+            found.append(f"{prefix}{name} ({present} there, {value} here)")
+    return found

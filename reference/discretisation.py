@@ -100,8 +100,8 @@ class Discretisation:
         nodes[cell_dofs(space)] = self.body.cells[self.cells][:, vtk_order(kind)]
         return nodes
 
-    def _gathered(self, own: NDArray[Any]) -> NDArray[Any]:
-        return own if self.comm.size == 1 else np.concatenate(self.comm.allgather(own))
+    def _gathered(self, own: NDArray[Any], axis: int = 0) -> NDArray[Any]:
+        return own if self.comm.size == 1 else np.concatenate(self.comm.allgather(own), axis)
 
     def _hold(self) -> None:
         axes = [self.numbers[self.held[self.local_nodes, axis], axis] for axis in range(self.body.dimension)]
@@ -117,22 +117,27 @@ class Discretisation:
         Raises:
             ValueError: another shape, NaN or infinity.
         """
-        values = checked_array(name, field, self.body.points.shape)
-        out = np.zeros(self.owned)
-        out[self.own_numbers] = values[self.nodes].ravel()
+        out = self.rows(checked_array(name, field, self.body.points.shape)[None])[0]
         if pressure is not None and self.mixed:
             own = self._pressure_numbers < self.owned
             out[self._pressure_numbers[own]] = pressure[self._pressure_nodes[own]]
         return out
 
+    def rows(self, fields: Floats) -> Floats:
+        """Nodal fields (k, n, 3) as rows of unknowns, pressures zero."""
+        out = np.zeros((len(fields), self.owned))
+        out[:, self.own_numbers] = fields[:, self.nodes].reshape(len(fields), -1)
+        return out
+
     def field(self, unknowns: Floats) -> Floats:
-        """Unknowns as a nodal field (n, 3), whole on every rank."""
-        return self.nodal(unknowns[self.own_numbers])
+        """Unknowns as a nodal field (n, 3), whole on every rank; rows of unknowns as several, (k, n, 3)."""
+        return self.nodal(unknowns[..., self.own_numbers])
 
     def nodal(self, own: Floats) -> Floats:
-        """Components of this rank, block by block, as a nodal field (n, 3), whole on every rank."""
-        whole = np.empty_like(self.body.points)
-        whole[self._all_nodes] = self._gathered(own.reshape(-1, self.body.dimension))
+        """Components of this rank, block by block, as nodal fields (..., n, 3), whole on every rank."""
+        rows = own.shape[:-1]
+        whole = np.empty((*rows, *self.body.points.shape))
+        whole[..., self._all_nodes, :] = self._gathered(own.reshape(*rows, -1, self.body.dimension), axis=-2)
         return whole
 
     def pressure(self, unknowns: Floats) -> Floats | None:

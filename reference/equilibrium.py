@@ -30,6 +30,7 @@ _GROWTH, _CUT = 1.5, 0.5  # of load steps after a success and a failure
 _FIRST_STEP = 0.25  # of the load where the whole load has failed
 _SMALLEST_STEP = 1e-6  # of the load; where not even that can be added there is a limit point
 _SHARES = (1.0, 0.5, 0.25)  # of the load whose linear response is warped for a start
+_TRUSTED = 0.9  # of the decrease that the tangent promises: less, and the warped response may be the better start
 _LOST = 1e-12  # relative force on held nodes that may be round-off
 
 
@@ -138,45 +139,46 @@ class Problem:
     ) -> Equilibrium:
         """The displacement that balances a load.
 
-        Tries the full load from the guess, then from the warped linear response, then from rest, then in load steps
-        that are halved where they fail and grow again where they succeed.
+        Tries the full load from the guess, then from the warped linear response (before the guess where an equilibrium
+        is too far), then from rest, then in load steps that are halved where they fail and grow where they succeed.
 
         Args:
             load: the load, or nodal forces alone, (n, 3), newtons.
-            guess: displacement to start from, (n, 3), metres, or another equilibrium; the warped linear response if not
-                given.
+            guess: displacement to start from, (n, 3), metres, or another equilibrium, which is first moved along its
+                tangent by the change of the load; the warped linear response if not given.
             stability: also factor the tangent at the state and count its negative pivots.
-            fallback: try the other ways where the first start fails; without, a failure is raised at once.
+            fallback: try the other ways where the guess fails; without, a failure there (and from the warped linear
+                response, where an equilibrium is too far) is raised at once.
             trace: keep every iteration in the result.
 
         Raises:
             ValueError: wrong shape, NaN or infinity, unknown names, forces on held nodes.
             NotConverged: no way led to an equilibrium; it holds the last one that was found on the way.
         """
-        wanted = self._load(load)
-        self._newton.suit(wanted)
+        given, wanted = self._load(load)
         self._newton.start_count()
         spent = 0
         if self.options.first_step == 1.0 or guess is not None:
-            for near, start in self._starts(wanted, guess):
-                attempt = self._newton.run(wanted, start, eliminate=not near)
+            for unknowns, eliminate in self._starts(wanted, guess, fallback):
+                attempt = self._newton.run(wanted, unknowns, eliminate=eliminate)
                 spent += attempt.iterations
                 if attempt.converged:
                     found = replace(attempt, iterations=spent)
-                    return self._result(found, wanted, load_steps=1, stability=stability, trace=trace)
-                if not fallback:
-                    raise NotConverged(
-                        f"Problem.solve: no equilibrium near the guess ({attempt.reason_name} after "
-                        f"{attempt.iterations} iterations).",
-                        trace=tuple(self._newton.trace),
-                    )
-        return self._solve_in_steps(wanted, spent, stability, trace)
+                    return self._result(found, given, wanted, load_steps=1, stability=stability, trace=trace)
+            if not fallback:
+                raise NotConverged(
+                    f"Problem.solve: no equilibrium near the guess ({attempt.reason_name} after {spent} iterations). "
+                    "Try a smaller change of the load, or fallback=True.",
+                    trace=tuple(self._newton.trace),
+                )
+        return self._solve_in_steps(given, wanted, spent, stability, trace)
 
-    def _load(self, load: Loading | ArrayLike) -> Load:
-        checked = checked_loading(load, self.body, self.held)
+    def _load(self, load: Loading | ArrayLike) -> tuple[Loading, Load]:
+        """A load in the body's numbers, a copy of the caller's, and as unknowns."""
+        checked = checked_loading(load, self.body, self.held).scaled(1.0)
         if checked.forces is not None:
             self._check_lost(np.asarray(checked.forces))
-        return self._forms.load(checked)
+        return checked, self._forms.load(checked)
 
     def _check_lost(self, forces: Floats) -> None:
         lost = np.where(self._space.held, forces, 0.0)
@@ -188,16 +190,58 @@ class Problem:
                 f"(first {where[:5]}), which would be lost; set them to zero or move them to free nodes."
             )
 
-    def _starts(self, load: Load, guess: ArrayLike | Equilibrium | None) -> Iterator[tuple[bool, Floats]]:
-        """States to start from, and whether the equilibrium near them is wanted, and not one that is near rest."""
-        fixed = self._space.fixed
-        if guess is not None:
-            start = self._unknowns(guess, "guess")
-            start[fixed] = load.lift[fixed]
-            yield True, start
-        yield False, self._first_guess(load)
-        if not self._has_lift(load):
-            yield False, np.zeros_like(load.dead)
+    def _starts(
+        self, load: Load, guess: ArrayLike | Equilibrium | None, fallback: bool
+    ) -> Iterator[tuple[Floats, bool]]:
+        """States to start from, the most promising first, and whether cells may be balanced alone on the way.
+
+        They may not where the equilibrium next to the guess is wanted: with them it may be another.
+        """
+        near, is_trusted = (None, False) if guess is None else self._near(guess, load)
+        if near is not None and is_trusted:
+            yield near, False
+            if not fallback:
+                return
+        starts = [self._first_guess(load)]
+        if near is not None and not is_trusted:
+            starts = sorted([*starts, near], key=lambda start: self._merit(start, load))
+        for start in starts:
+            yield start, True
+        if fallback and not self._has_lift(load):
+            yield np.zeros_like(load.dead), True
+
+    def _near(self, guess: ArrayLike | Equilibrium, load: Load) -> tuple[Floats, bool]:
+        """The guess, an equilibrium moved along its tangent by the change of the load, and whether that can be trusted.
+
+        A large change leads astray: from there Newton's method needs up to ten times the factorisations that it needs
+        from the warped response.
+        """
+        start = self._unknowns(guess, "guess")
+        start[self._space.fixed] = load.lift[self._space.fixed]
+        if not isinstance(guess, Equilibrium):
+            return start, True
+        gap = self._forms.residual(start, load)
+        gap[self._space.fixed] = 0.0
+        self._linearise(guess)
+        step = -self._newton.linear.solve(gap[None])[0]
+        at, ahead = self._merit(start, load), self._merit(start + step, load)
+        promised = at if self._space.mixed else -0.5 * self._space.dot(gap, step)
+        if 0.0 <= _TRUSTED * promised <= at - ahead:
+            return start + step, True
+        return (start + step, False) if ahead < at else (start, False)
+
+    def _merit(self, unknowns: Floats, load: Load) -> float:
+        """How far from balance a state is, less is closer: its energy under the load; infinite inside out.
+
+        With pressures as unknowns equilibrium is no minimum: the norm of the residual.
+        """
+        if self._space.mixed:
+            gap = self._forms.residual(unknowns, load)
+            merit = self._space.norm(gap) if np.isfinite(self._forms.energy(unknowns)) else np.inf
+        else:
+            work = self._forms.pressure_work(np.zeros_like(unknowns), unknowns, load)
+            merit = self._forms.potential(unknowns, load) - work
+        return merit if np.isfinite(merit) else np.inf
 
     def _has_lift(self, load: Load) -> bool:
         return self._space.dot(load.lift, load.lift) > 0.0
@@ -221,7 +265,7 @@ class Problem:
         best, lowest = np.zeros_like(linear), 0.0
         for share in _SHARES:
             start = self._warped(share * linear, load)
-            energy = self._forms.potential(start, load) - self._forms.pressure_work(np.zeros_like(start), start, load)
+            energy = self._merit(start, load)
             if energy < lowest:
                 best, lowest = start, energy
             elif lowest < 0.0:
@@ -278,7 +322,7 @@ class Problem:
         assemble(matrix, laplacian, space.conditions)
         self._poisson = LinearSolver(matrix, space, self._newton.linear.method, turns=False)
 
-    def _solve_in_steps(self, load: Load, spent: int, stability: bool, trace: bool) -> Equilibrium:
+    def _solve_in_steps(self, given: Loading, load: Load, spent: int, stability: bool, trace: bool) -> Equilibrium:
         reached, good = 0.0, 0
         step = min(_FIRST_STEP, self.options.first_step) if spent else self.options.first_step
         state = np.zeros_like(load.dead)
@@ -296,9 +340,11 @@ class Problem:
             reached, state, good, last = target, attempt.unknowns, good + 1, attempt
             step *= _GROWTH
             if reached == 1.0:
-                return self._result(replace(attempt, iterations=spent), load, good, stability, trace)
+                return self._result(replace(attempt, iterations=spent), given, load, good, stability, trace)
         lines = tuple(self._newton.trace)
-        found = None if last is None else self._result(last, load.scaled(reached), good, True, False)
+        found = None
+        if last is not None:
+            found = self._result(last, given.scaled(reached), load.scaled(reached), good, True, False)
         advice = (
             "No more load can be added there: a limit point, or a mesh too coarse for it. Try a smaller load, a finer "
             "mesh, or displacements prescribed instead of forces."
@@ -313,7 +359,9 @@ class Problem:
             lines,
         )
 
-    def _result(self, attempt: Attempt, load: Load, load_steps: int, stability: bool, trace: bool) -> Equilibrium:
+    def _result(
+        self, attempt: Attempt, given: Loading, load: Load, load_steps: int, stability: bool, trace: bool
+    ) -> Equilibrium:
         unknowns = attempt.unknowns
         energy = self._forms.potential(unknowns, load) + self._forms.pressure_potential(unknowns, load)
         iterations, factorisations = attempt.iterations, self._newton.factorisations
@@ -330,12 +378,13 @@ class Problem:
             pressure=self._space.pressure(unknowns),
             trace=lines,
             local_iterations=self._newton.local_iterations,
+            load=given,
         )
 
     # ------------------------------------------------------------------ the tangent at a state
 
     def energy(self, displacement: ArrayLike | Equilibrium) -> float:
-        """Strain energy of a displacement (n, 3), joules; NaN where a cell is inside out."""
+        """Strain energy of a displacement (n, 3), joules; infinite where a cell is inside out."""
         return self._forms.energy(self._unknowns(displacement))
 
     def internal_forces(self, displacement: ArrayLike | Equilibrium) -> Floats:
@@ -349,7 +398,7 @@ class Problem:
             load: the load.
             displacement: gives the shape that a following pressure acts on, (n, 3), metres; rest if not given.
         """
-        wanted = self._load(load)
+        _, wanted = self._load(load)
         unknowns = self._unknowns(displacement)
         pressed = self._forms.pressed(unknowns, wanted)
         pressed[self._space.fixed] = 0.0
@@ -358,12 +407,14 @@ class Problem:
     def stiffness(self, displacement: ArrayLike | Equilibrium | None = None) -> csr_matrix:
         """Tangent stiffness in the body's order, (3n, 3n), N/m; rows and columns of held axes are the identity's.
 
+        An equilibrium's following pressures are part of it; a displacement alone has none.
+
         Raises:
             RuntimeError: the mesh is shared between ranks, or pressures are unknowns.
         """
         if self._space.comm.size > 1 or self._space.mixed:
             raise RuntimeError("Problem.stiffness: expected one rank and displacements alone as unknowns.")
-        self._newton.assemble(self._unknowns(displacement), self._unloaded)
+        self._linearise(displacement)
         return self._in_body_order(self._newton.matrix)
 
     def mass(self, density: float = 1.0) -> csr_matrix:
@@ -388,35 +439,65 @@ class Problem:
         index[rows] = self._space.own_numbers
         return csr_matrix((data, indices, indptr), shape=matrix.getSize())[index][:, index]
 
-    def apply_inverse(self, columns: ArrayLike, displacement: ArrayLike | Equilibrium | None = None) -> Floats:
+    def apply_inverse(
+        self, columns: ArrayLike, displacement: ArrayLike | Equilibrium | None = None, *, transpose: bool = False
+    ) -> Floats:
         """K(u)^-1 applied to many right-hand sides with one factorisation.
 
         Args:
             columns: nodal forces or cotangents, (3n, k) or (3n,), in the body's order; held axes are ignored.
-            displacement: state u, (n, 3), metres; rest if not given. The last factorisation is used again where it was
-                made at the same state.
+            displacement: an equilibrium, whose pressures belong to its tangent; or a displacement alone, (n, 3),
+                metres, under no following pressure; rest if not given. The last factorisation is used again where it
+                was made at the same state.
+            transpose: K(u)^-T; another matrix where a following pressure makes the tangent unsymmetric.
+
+        Raises:
+            ValueError: wrong shape, or a displacement alone where the pressure is an unknown.
         """
         right = np.asarray(columns, dtype=np.float64)
         count = self.body.points.size
         if right.shape[:1] != (count,) or right.ndim > 2:
             raise ValueError(f"apply_inverse.columns: expected shape ({count}, k), got {right.shape}.")
-        self._newton.assemble(self._unknowns(displacement), self._unloaded)
-        stacked = right.reshape(count, -1).T.reshape(-1, *self.body.points.shape)
-        rows = np.array([self._space.unknowns("columns", field) for field in stacked])
+        if not np.isfinite(right).all():
+            raise ValueError("apply_inverse.columns: expected finite numbers, got NaN or infinity.")
+        self._linearise(displacement)
+        rows = self._space.rows(right.reshape(count, -1).T.reshape(-1, *self.body.points.shape))
         rows[:, self._space.fixed] = 0.0
-        solved = self._newton.linear.solve(rows)
-        return np.array([self._space.field(row).ravel() for row in solved]).T.reshape(right.shape)
+        solved = self._newton.linear.solve(rows, transpose)
+        return self._space.field(solved).reshape(len(rows), count).T.reshape(right.shape)
 
     def negative_pivots(self, displacement: ArrayLike | Equilibrium | None = None) -> int | None:
-        """Negative pivots of the tangent at a state: 0 is stable, None where nothing is factored (multigrid)."""
-        return self._negative_pivots(self._unknowns(displacement), self._unloaded)
+        """Negative pivots of the tangent at a state: 0 is stable.
+
+        None where nothing is factored (multigrid) or where following pressures make the tangent unsymmetric.
+
+        Args:
+            displacement: an equilibrium, or a displacement alone, (n, 3), under no following pressure; rest if not
+                given.
+        """
+        return self._negative_pivots(*self._tangent_point(displacement))
 
     def _negative_pivots(self, unknowns: Floats, load: Load) -> int | None:
-        if self._newton.linear.method == "multigrid" or not self._newton.symmetric:
+        if self._newton.linear.method == "multigrid":
             return None
-        self._newton.assemble(unknowns, load)
+        self._newton.linearise(unknowns, load)
         pivots = self._newton.linear.negative_pivots()
         return None if pivots is None else pivots - self._space.pressures  # a saddle point has one for each pressure
+
+    def _linearise(self, state: ArrayLike | Equilibrium | None) -> None:
+        self._newton.linearise(*self._tangent_point(state))
+
+    def _tangent_point(self, state: ArrayLike | Equilibrium | None) -> tuple[Floats, Load]:
+        """What a tangent depends on: unknowns, and following pressures."""
+        if isinstance(state, Equilibrium):
+            pressure = {name: float(value) for name, value in state.load.pressure.items() if value != 0.0}
+            return self._unknowns(state), replace(self._unloaded, pressure=pressure)
+        if state is not None and self._space.mixed:
+            raise ValueError(
+                "Problem.displacement: expected an Equilibrium, for the tangent depends on its pressure, "
+                f"got {type(state).__name__}."
+            )
+        return self._unknowns(state), self._unloaded
 
     def _unknowns(self, state: ArrayLike | Equilibrium | None, name: str = "displacement") -> Floats:
         if state is None:

@@ -27,9 +27,12 @@ from .fenicsx import (
     ufl,
 )
 from .loading import Loading
-from .materials import Material, Parameter
+from .materials import Energy, Material, Parameter, is_same_law
 
 Floats = NDArray[np.float64]
+
+_INSIDE_OUT = 1e250  # energy per volume of what is turned inside out, J/m^3; times any cell's volume it is above
+_MOST = 1e200  # joules
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +93,9 @@ class Forms:
         Raises:
             ValueError: another law, or a number where there was one for each cell, or the reverse.
         """
-        if type(material) is not type(self.material) or set(material.parameters) != set(self.parameters):
-            raise ValueError(f"material: expected another {type(self.material).__name__}, got {material!r}.")
+        if not is_same_law(material, self.material):
+            same = " of the same function and parameters" if isinstance(self.material, Energy) else ""
+            raise ValueError(f"material: expected another {type(self.material).__name__}{same}, got {material!r}.")
         for name, value in material.parameters.items():
             if np.ndim(value) != np.ndim(self.material.parameters[name]):
                 raise ValueError(f"material.{name}: expected the shape that the problem was built with, got {value!r}.")
@@ -116,9 +120,9 @@ class Forms:
         psi = self.energy_density(u, pressure, self.parameters)
         guarded = psi
         if not self.material.is_linear:
-            # The vanishing term turns the energy into NaN where the body is turned inside out, for every material.
-            F = self.space.deformation_gradient(u)
-            guarded = psi + constant(self.space.mesh, 0.0) * ufl.ln(ufl.det(F))
+            # Asked for and not left to NaN, which compilers may take for impossible (-ffast-math).
+            is_turned = ufl.le(ufl.det(self.space.deformation_gradient(u)), 0.0)
+            guarded = ufl.conditional(is_turned, _INSIDE_OUT, psi)
         residual = ufl.derivative(psi * self.dx, self.space.state, ufl.TestFunction(self.space.space))
         tangent = ufl.derivative(residual, self.space.state, ufl.TrialFunction(self.space.space))
         self._energy = form(guarded * self.dx)
@@ -218,9 +222,10 @@ class Forms:
         return self.assembled(self._tangent_action)
 
     def energy(self, unknowns: Floats) -> float:
-        """Strain energy, joules; NaN where a cell is inside out."""
+        """Strain energy, joules; infinite where a cell is inside out."""
         self.space.set_state(unknowns)
-        return scalar(self._energy, self.space.comm)
+        energy = scalar(self._energy, self.space.comm)
+        return energy if energy < _MOST else np.inf
 
     def potential(self, unknowns: Floats, load: Load) -> float:
         """Strain energy minus the work of dead forces, joules."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import sys
-import time
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +19,7 @@ import mpi4py
 import numpy as np
 import scipy
 import zarr
+from filelock import FileLock, Timeout
 from mpi4py.futures import MPICommExecutor
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
@@ -24,19 +27,31 @@ from tqdm import tqdm
 
 from softtwin.meshes.body import Body
 
-from .dataset import SPLITS, DataSet, DataSetError, LinearResponse, create, write_block
+from .dataset import (
+    SPLITS,
+    DataSet,
+    DataSetError,
+    LinearResponse,
+    create,
+    differences,
+    drop_block,
+    existing,
+    write_block,
+)
 from .equilibrium import NewtonOptions, Problem
 from .fenicsx import MPI, PETSc, dolfinx
-from .loads import LoadPlan, draw_load, loaded_nodes
+from .loads import LoadPlan, check_loads, draw_load, loaded_nodes
 from .materials import MATERIALS, Material
 from .modes import eigenmodes
 from .outcome import Equilibrium, NotConverged
+from .ranks import on_first, tell_all
 
 Floats = NDArray[np.float64]
 
 _EXACT_COLUMNS = 1500  # up to so many loaded unknowns the linear response is kept whole
 _RANK = 512  # else its best approximation of this rank: 0.04 % of the displacement on the beam
 _PILOTS = 9
+_PATIENCE_S = 20.0  # ranks live on for a moment when their mpirun is killed
 _BEYOND = 2.0  # draws that move more than twice the wanted top are kept apart
 
 
@@ -92,71 +107,118 @@ def plan_from_header(header: Mapping[str, Any]) -> Plan:
     return Plan(**{**stored, "loads": LoadPlan(**loads), "newton": NewtonOptions(**stored["newton"])})
 
 
-def generate(path: Path | str, body: Body, plan: Plan, comm: Any = MPI.COMM_WORLD) -> DataSet | None:
+class DamagedBlock(UserWarning):
+    """A block that was not as it was written, and is made again."""
+
+
+def generate(
+    path: Path | str | None,
+    body: Body | None,
+    plan: Plan | None,
+    comm: Any = MPI.COMM_WORLD,
+    redo: Sequence[int] = (),
+    again: bool = False,
+) -> DataSet | None:
     """Make a data set, or go on with one that was interrupted; collective over the communicator.
 
     With one rank the blocks are solved one after the other. With more, rank 0 hands blocks out by `mpi4py.futures`
-    and solves blocks itself meanwhile. The data do not depend on the number of ranks.
+    and solves blocks itself meanwhile. The data do not depend on the number of ranks. Blocks that are damaged are
+    made again, with a warning that names them.
 
     Args:
-        path: folder of the data set.
+        path: folder of the data set; as body and plan read on rank 0 alone, the others may give None.
         body: the body.
         plan: what to generate.
         comm: the ranks that share the work.
+        redo: numbers of blocks to make again.
+        again: throw away what is there.
 
     Returns:
         The data set on rank 0, None on the others.
 
     Raises:
-        DataSetError: there is a data set of another plan or body at the path.
+        DataSetError: there is a data set of another plan or body at the path, somebody else writes it, or blocks to
+            make again are not there.
+        FailedElsewhere: on the others, where rank 0 raises one of these or what else went wrong, on any rank.
+        ValueError: loads that the body cannot carry.
     """
-    path = Path(path)
-    with threadpool_limits(1):  # sums by several BLAS threads differ in their last bits; ranks are the parallelism
-        if comm.rank == 0:
-            _prepare(path, body, plan)
-        _wait_for_all(comm)
-        _solve_missing(path, comm)
-    return DataSet(path) if comm.rank == 0 else None
+    with threadpool_limits(1), ExitStack() as held:  # sums by several BLAS threads differ in their last bits
+
+        def prepare() -> tuple[Path, list[int]]:
+            assert path is not None and body is not None and plan is not None, "rank 0 gives all three"
+            held.enter_context(_locked(Path(path)))
+            return Path(path), _prepare(Path(path), body, plan, redo, again)
+
+        folder, blocks = on_first(comm, prepare) or (None, [])
+        _solve(comm.bcast(folder, root=0), blocks, comm)
+    return DataSet(folder) if folder is not None else None
 
 
-def _solve_missing(path: Path, comm: Any) -> None:
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Keep others from writing the same data set; the system lets go of the lock when the process ends in any way."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(path.with_name(f".{path.name}.lock"), timeout=_PATIENCE_S)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise DataSetError(
+            f"generate.path: another `generate` is at work in {path}; wait for it, end it, or choose another folder."
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _solve(path: Path, blocks: list[int], comm: Any) -> None:
     if comm.size == 1:
-        _solve_here(path, DataSet(path).missing_blocks())
+        _solve_here(path, blocks)
         return
+    failure: BaseException | None = None
     with MPICommExecutor(comm, root=0) as pool:
         if pool is not None:
-            _farm(pool, path, DataSet(path).missing_blocks(), workers=comm.size - 1)
+            try:
+                _farm(pool, path, blocks, workers=comm.size - 1)
+            except BaseException as error:  # whatever it is, the others wait for word of it
+                failure = error
+    tell_all(comm, failure)
 
 
-def _wait_for_all(comm: Any) -> None:
-    """A barrier that leaves the cores to the rank that is still at work: MPI's own spins."""
-    request = comm.Ibarrier()
-    while not request.Test():
-        time.sleep(0.02)
-
-
-def _prepare(path: Path, body: Body, plan: Plan) -> None:
-    description = _plain(plan)
-    if (path / "zarr.json").exists():
-        try:
-            present = DataSet(path)
-        except DataSetError:
-            present = None  # interrupted before its header was written
-        if present is not None:
-            _check_same(present, body, description)
-            return
+def _prepare(path: Path, body: Body, plan: Plan, redo: Sequence[int], again: bool) -> list[int]:
+    """Make the data set where there is none; returns the numbers of the blocks to solve."""
+    check_loads(body, plan.loads)
+    present = None if again else existing(path)
+    if present is not None and not _is_another(present, body, plan):
+        return _unfinished(present, redo)
+    if redo:
+        raise DataSetError(f"generate.redo: expected a data set with blocks {list(redo)} in {path}, found none.")
     with Problem(body, plan.build_material(), plan.newton) as problem:
         modes = eigenmodes(problem, plan.loads.modes)
         response = linear_response(problem, loaded_nodes(body, plan.loads), plan.seed)
         amplitude = plan.loads.amplitude or _calibrate(problem, response, modes.shapes, plan)
     header = {
-        "plan": description,
+        "plan": _plain(plan),
         "block": plan.block,
         "samples": dict(plan.samples),
         "amplitude": amplitude,
         "versions": versions(),
     }
-    create(path, header, body, response, modes.shapes, modes.eigenvalues)
+    return create(path, header, body, response, modes.shapes, modes.eigenvalues).missing_blocks()
+
+
+def _unfinished(present: DataSet, redo: Sequence[int]) -> list[int]:
+    count = present.block_count
+    wrong = [block for block in redo if not 0 <= block < count]
+    if wrong:
+        raise DataSetError(f"generate.redo: expected numbers of blocks in 0..{count - 1}, got {wrong}.")
+    _ = present.response, present.shapes  # damage to what no block holds is found here
+    damaged = present.damaged_blocks()
+    for block, damage in damaged.items():
+        warnings.warn(f"block {block} in {present.path} {damage}; it is made again.", DamagedBlock, stacklevel=2)
+    for block in {*redo, *damaged}:
+        drop_block(present.path, block)
+    return present.missing_blocks()
 
 
 def _plain(plan: Plan) -> dict[str, Any]:
@@ -167,16 +229,23 @@ def _plain(plan: Plan) -> dict[str, Any]:
     return description
 
 
-def _check_same(present: DataSet, body: Body, description: dict[str, Any]) -> None:
-    if present.body.fingerprint != body.fingerprint:
-        raise DataSetError(f"generate.path: {present.path} holds a data set of another body; choose another folder.")
-    stored = present.header["plan"]
-    differing = [key for key in description if stored.get(key) != description[key]]
-    if differing:
+def _is_another(present: DataSet, body: Body, plan: Plan) -> bool:
+    """Whether nothing of the data set serves: it is of another plan or body, and no block of it was solved.
+
+    Raises:
+        DataSetError: it is another one, and blocks of it were solved.
+    """
+    wanted, stored = json.loads(json.dumps(_plain(plan))), present.header["plan"].get("newton", {})
+    # An option that is newer than the data set had its default when the data set was made.
+    usual = {name: value for name, value in asdict(NewtonOptions()).items() if name not in stored}
+    wanted["newton"] = {name: value for name, value in wanted["newton"].items() if usual.get(name, ...) != value}
+    found = differences(present, body, wanted)
+    if found and len(present.missing_blocks()) < present.block_count:
         raise DataSetError(
-            f"generate.path: {present.path} was made with another plan (differs in {differing}); "
-            "choose another folder, or the configuration it was made with to go on."
+            f"generate.path: {present.path} was made with another plan or body (differs in {'; '.join(found)}); choose "
+            "another folder, go on with what it was made with, or throw it away (`softtwin generate --again`)."
         )
+    return bool(found)
 
 
 def versions() -> dict[str, str]:
@@ -224,7 +293,13 @@ def _calibrate(problem: Problem, response: LinearResponse, shapes: Floats, plan:
     for i in tqdm(range(_PILOTS), desc="calibrating the loads", unit="load", disable=_quiet()):
         load = draw_load(problem.body, shapes, plan.loads, np.random.default_rng([plan.seed, 1, i]))
         found.append(_reach(problem, load / _peak(response.apply(load[None, response.loaded])[0]), plan))
-    return float(np.median(found))
+    amplitude = float(np.median(found))
+    if not amplitude > 0.0:
+        raise RuntimeError(
+            f"generate.plan: most pilot loads found no equilibrium at a sixth of the wanted displacement, "
+            f"{plan.loads.displacement:.3g} m; lower LoadPlan.displacement, or raise NewtonOptions.max_iterations."
+        )
+    return amplitude
 
 
 def _reach(problem: Problem, unit: Floats, plan: Plan) -> float:
@@ -295,7 +370,8 @@ def _take(source: Iterator[int], count: int) -> Iterator[int]:
 
 
 @lru_cache(maxsize=1)
-def _opened(path: str) -> tuple[DataSet, Plan, Problem]:
+def _opened(path: str, made: int) -> tuple[DataSet, Plan, Problem]:
+    """What a block needs; `made`, the time of the header, tells a data set that was made again in the same place."""
     data = DataSet(path)
     plan = plan_from_header(data.header)
     return data, plan, Problem(data.body, plan.build_material(), plan.newton)
@@ -308,7 +384,7 @@ def solve_block(path: str, block: int) -> int:
         path: folder of the data set.
         block: number of the block.
     """
-    data, plan, problem = _opened(path)
+    data, plan, problem = _opened(path, (Path(path) / "zarr.json").stat().st_mtime_ns)
     with threadpool_limits(1):
         paths = range(block * plan.block // plan.path, (block + 1) * plan.block // plan.path)
         rows = [row for number in paths for row in _solve_path(data, plan, problem, number)]

@@ -6,7 +6,6 @@ processor; tensors of another type or device come and go by conversion.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from .equilibrium import Problem
+from .materials import with_parameters
 from .outcome import Equilibrium
 from .sensitivity import Change, Linearisation
 
@@ -62,7 +62,7 @@ class EquilibriumLayer:
         """Give the problem these parameters, unless it has them."""
         wanted = {name: _array(value) for name, value in zip(self.names, parameters, strict=True)}
         if any(not np.array_equal(wanted[name], value) for name, value in self.problem.material.parameters.items()):
-            self.problem.set_material(replace(self.problem.material, **wanted))  # type: ignore[type-var]
+            self.problem.set_material(with_parameters(self.problem.material, wanted))
 
 
 class _Equilibrium(torch.autograd.Function):

@@ -158,8 +158,17 @@ class LinearSolver:
         self.ksp.setOperators(self.matrix)
         self.ksp.setUp()
 
+    @property
+    def _cannot_solve(self) -> bool:
+        if self._band is not None:
+            return self._band.has_failed
+        return self.method != "multigrid" and _has_failed(self.ksp)
+
     def finished(self, direction: Floats) -> Floats:
-        """What SNES's own solver gave as a direction, with the work that was left outside of PETSc."""
+        """What SNES's own solver gave as a direction, with the work that was left outside of PETSc.
+
+        Not finite where the matrix is singular.
+        """
         if self._band is None:
             return direction
         self._band.prepare()
@@ -169,10 +178,12 @@ class LinearSolver:
         """K^-1 applied to each row, (k, owned unknowns).
 
         Raises:
-            RuntimeError: the iterative solver did not converge.
+            RuntimeError: the iterative solver did not converge, or the matrix is singular.
         """
         self.tighten()
         self.prepare()
+        if self._cannot_solve:
+            raise RuntimeError("LinearSolver.solve: expected a matrix that can be inverted, got a singular one.")
         if self._band is not None:
             return self._band.solve(rows)
         if self.method != "multigrid" and len(rows) > 1 and self._space.comm.size == 1 and not transpose:
@@ -236,7 +247,15 @@ class _Band:
         self._factored = state
 
     def solve(self, rows: Floats) -> Floats:
-        return self._factor.solve(rows) if self._definite else _solve_dense(self._mumps, rows)
+        """The inverse applied to each row; NaN where MUMPS could not factor the matrix either."""
+        if self._definite:
+            return self._factor.solve(rows)
+        return np.full_like(rows, np.nan) if self.has_failed else _solve_dense(self._mumps, rows)
+
+    @property
+    def has_failed(self) -> bool:
+        """True where MUMPS could not factor the matrix either."""
+        return not self._definite and _has_failed(self._mumps)
 
     def negative_pivots(self) -> int:
         return 0 if self._definite else _pivots(self._mumps)
@@ -250,6 +269,10 @@ def _use_mumps(ksp: Any, symmetric: bool) -> None:
     ksp.setType("preonly")
     ksp.getPC().setType("cholesky" if symmetric else "lu")
     ksp.getPC().setFactorSolverType("mumps")
+
+
+def _has_failed(ksp: Any) -> bool:
+    return int(ksp.getPC().getFactorMatrix().getMumpsInfog(1)) < 0
 
 
 def _pivots(ksp: Any) -> int:

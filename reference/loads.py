@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -47,9 +47,41 @@ class LoadPlan:
             raise ValueError(f"LoadPlan.displacement: expected a positive length in metres, got {self.displacement}.")
 
 
+def check_loads(body: Body, plan: LoadPlan) -> None:
+    """Refuse a plan that a body cannot carry, before anything is solved.
+
+    Args:
+        body: the body.
+        plan: how loads are to be drawn.
+
+    Raises:
+        ValueError: nothing to load, too many modes, or a displacement beyond the size of the body.
+    """
+    loaded_nodes(body, plan)
+    for name in plan.zones:
+        loaded_nodes(body, replace(plan, zones=(name,)))
+    most = 3 * len(body.free) // 2 - 1
+    if plan.modes > most:
+        raise ValueError(f"LoadPlan.modes: expected 1..{most} for {len(body.free)} free nodes, got {plan.modes}.")
+    size = float(np.linalg.norm(np.ptp(body.points, axis=0)))
+    if plan.amplitude is None and plan.displacement > size:
+        raise ValueError(
+            f"LoadPlan.displacement: expected at most the size of the body, {size:.3g} m, got {plan.displacement:.6g}."
+        )
+
+
 def loaded_nodes(body: Body, plan: LoadPlan) -> Ints:
-    """Numbers of the nodes that may carry force, sorted: the free boundary nodes of the zones."""
+    """Numbers of the nodes that may carry force, sorted: the free boundary nodes of the zones.
+
+    Raises:
+        ValueError: a zone that the body lacks, or no free node on the boundary or in the zones.
+    """
     allowed = np.setdiff1d(body.boundary_nodes, body.fixed)
+    if len(allowed) == 0:
+        raise ValueError(
+            f"Body.fixed: expected free nodes on the boundary, got all {len(body.boundary_nodes)} of them fixed; "
+            "nothing is left that a load could act on."
+        )
     if not plan.zones:
         return allowed
     missing = [name for name in plan.zones if name not in body.node_sets]

@@ -6,7 +6,7 @@ Every parameter is a number or an array with one value a cell. A material of one
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType, SimpleNamespace
 from typing import Any, Protocol
 
@@ -307,6 +307,22 @@ class Energy:
     def energy(self, F: Any, pressure: Any, p: SimpleNamespace) -> Any:
         """Strain energy per volume at rest, J/m^3."""
         return self.function(F, **vars(p))
+
+
+def is_same_law(one: Material, other: Material) -> bool:
+    """Whether two materials differ in the values of their parameters alone."""
+    if type(one) is not type(other) or set(one.parameters) != set(other.parameters):
+        return False
+    if isinstance(one, Energy) and isinstance(other, Energy):
+        return one.function is other.function and one.is_linear == other.is_linear
+    return True
+
+
+def with_parameters(material: Material, values: Mapping[str, Parameter]) -> Material:
+    """The same law with other values of some parameters."""
+    if isinstance(material, Energy):
+        return replace(material, parameters={**material.parameters, **values})
+    return replace(material, **values)  # type: ignore[type-var]
 
 
 # Materials that Young's modulus and Poisson's ratio define, by the name they have in configuration files.

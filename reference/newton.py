@@ -176,6 +176,7 @@ class Newton:
             factor: part of the full load that this is, for the trace.
             eliminate: balance few cells alone where a step is cut, a few times; then give up.
         """
+        self.suit(load)
         self._load, self._factor = load, factor
         self._norms: list[float] = []
         self._search_failed = False
@@ -228,16 +229,25 @@ class Newton:
 
     def assemble(self, unknowns: Floats, load: Load) -> None:
         """The tangent at a state, unless it is there already."""
-        at = self.factored_at
-        here = at is not None and at[1] == load.pressure and np.array_equal(at[0], unknowns)
-        if self.space.comm.size > 1:
-            here = bool(self.space.comm.allreduce(int(here)) == self.space.comm.size)
-        if here:
+        if self._is_at(unknowns, load):
             return
         self.factored_at = None
         self.forms.tangent(unknowns, load, self.matrix)
         self.factored_at = (unknowns.copy(), dict(load.pressure))
         self.factorisations += 1
+
+    def _is_at(self, unknowns: Floats, load: Load) -> bool:
+        at = self.factored_at
+        here = at is not None and at[1] == load.pressure and np.array_equal(at[0], unknowns)
+        if self.space.comm.size > 1:
+            here = bool(self.space.comm.allreduce(int(here)) == self.space.comm.size)
+        return here
+
+    def linearise(self, unknowns: Floats, load: Load) -> None:
+        """The tangent at a state that was found, in the linear solver that suits its pressures."""
+        if not self._is_at(unknowns, load):
+            self.suit(load)
+            self.assemble(unknowns, load)
 
     def _test(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
         reasons = PETSc.SNES.ConvergedReason

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .loading import Loading
 
 Floats = NDArray[np.float64]
 
@@ -49,6 +51,7 @@ class Equilibrium:
         pressure: (n,), pascals, positive in compression, where it is an unknown.
         trace: every iteration, where asked for.
         local_iterations: Newton iterations of a few cells alone (nonlinear elimination).
+        load: what is in balance; its following pressures belong to the tangent.
     """
 
     displacement: Floats
@@ -62,6 +65,7 @@ class Equilibrium:
     pressure: Floats | None = None
     trace: tuple[Iteration, ...] = ()
     local_iterations: int = 0
+    load: Loading = field(default_factory=Loading)
 
     @property
     def is_stable(self) -> bool:

@@ -91,8 +91,7 @@ class Linearisation:
         right = right.copy()
         right[self._space.fixed] = 0.0
         newton = self.problem._newton
-        newton.suit(self._load)
-        newton.assemble(self._state, self._load)
+        newton.linearise(self._state, self._load)
         return newton.linear.solve(right[None], transpose)[0]
 
     def tangent(self, change: Change) -> Floats:

@@ -1,4 +1,4 @@
-"""What registration needs of a forward model, whoever provides it."""
+"""What registration needs of a forward model, whoever provides it: states that carry their own derivatives."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
 
@@ -13,77 +14,127 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-class ForwardModel(Protocol):
-    """Nodal forces to nodal displacements, with derivatives at the last state.
+class State(Protocol):
+    """A displacement with its derivatives by the nodal forces: a value, whatever its model solves afterwards."""
 
-    The reference, every surrogate and the hybrid satisfy it; all arrays are in the body's node order.
+    @property
+    def displacement(self) -> Floats:
+        """(n, 3), metres."""
+
+    @property
+    def negative_pivots(self) -> int | None:
+        """Negative pivots of the tangent: 0 is stable, None where the model does not know."""
+
+    @property
+    def extent(self) -> float | None:
+        """How far the load lies out: 1 at the largest that the model has learned; None for a model without a limit."""
+
+    def push(self, changes: ArrayLike) -> Floats:
+        """Change of the displacement, (3n, k), for small changes of the forces, (3n, k)."""
+
+    def pull(self, cotangent: ArrayLike) -> Floats:
+        """Gradient with respect to the forces, (n, 3), from the one with respect to the displacement, (n, 3).
+
+        Several at once have the shape (k, n, 3), and so have their gradients.
+        """
+
+
+class ForwardModel(Protocol):
+    """Nodal forces to states.
+
+    The reference and every surrogate satisfy it; all arrays are in the body's node order.
     """
 
     @property
     def body(self) -> Body:
         """The body that deforms."""
 
-    def reset(self) -> None:
-        """Forget the last state: the next solve starts from rest."""
+    @property
+    def error(self) -> float:
+        """Error of the displacement to be reckoned with where it is worst, metres; 0 for the reference."""
 
-    def solve(self, forces: ArrayLike) -> Floats:
-        """Displacement, (n, 3) metres, under nodal forces, (n, 3) newtons."""
+    def solve(self, forces: ArrayLike, near: Any = None) -> State:
+        """The state under nodal forces, (n, 3) newtons.
 
-    def pullback(self, cotangent: ArrayLike) -> Floats:
-        """Gradient with respect to the forces, (n, 3), from the one with respect to the displacement, (n, 3)."""
-
-    def sensitivity(self, columns: ArrayLike) -> Floats:
-        """Change of the displacement, (3n, k), for small changes of the forces, (3n, k)."""
-
-
-class Restricted(Protocol):
-    """A forward model from the coefficients of a control to the displacement of some nodes."""
-
-    def solve_coefficients(self, coefficients: Floats) -> Floats:
-        """Displacement of the chosen nodes, (p, 3) metres, for coefficients (k,)."""
-
-    def jacobian(self, coefficients: Floats) -> Floats:
-        """Its derivative, (3p, k)."""
-
-    def full(self, coefficients: Floats) -> Floats:
-        """Displacement of all nodes, (n, 3) metres."""
+        Args:
+            forces: nodal forces, (n, 3), newtons.
+            near: a state of this model to start from, where that helps; from rest if not given.
+        """
 
 
-class _RestrictedModel:
-    """Any forward model, restricted by picking rows and multiplying with the basis."""
+class ReducedState(Protocol):
+    """A state as a function of a few force coefficients, seen at chosen nodes."""
+
+    @property
+    def positions(self) -> Floats:
+        """Displacement of the chosen nodes, (p, 3), metres."""
+
+    @property
+    def full(self) -> State:
+        """The whole state."""
+
+    def jacobian(self, rows: csr_array) -> Floats:
+        """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p)."""
+
+    def moved(self, change: Floats) -> Floats:
+        """First-order displacement of the chosen nodes, (p, 3), for a change of the coefficients, (k,)."""
+
+
+class ReducedModel(Protocol):
+    """A forward model between the coefficients of a force basis and chosen nodes."""
+
+    def solve(self, coefficients: Floats, near: Any = None) -> ReducedState:
+        """The state for coefficients (k,)."""
+
+
+class _PickedState:
+    """Any state behind a force basis: rows of the whole."""
+
+    def __init__(self, model: _PickedModel, coefficients: Floats, full: State) -> None:
+        self._model, self.coefficients, self.full = model, coefficients, full
+        self._pushed: Floats | None = None
+
+    @property
+    def positions(self) -> Floats:
+        return self.full.displacement[self._model.nodes]
+
+    def _basis_pushed(self) -> Floats:
+        if self._pushed is None:
+            self._pushed = self.full.push(self._model.basis)[self._model.rows]
+        return self._pushed
+
+    def jacobian(self, rows: csr_array) -> Floats:
+        return rows @ self._basis_pushed()
+
+    def moved(self, change: Floats) -> Floats:
+        return (self._basis_pushed() @ change).reshape(-1, 3)
+
+
+class _PickedModel:
+    """Any forward model, reduced by multiplying with the basis and picking rows."""
 
     def __init__(self, model: ForwardModel, nodes: Ints, basis: Floats) -> None:
-        self._model = model
-        self._nodes = nodes
-        self._rows = (3 * nodes[:, None] + np.arange(3)).ravel()
-        self._basis = basis
-        self._last: Floats | None = None
+        self.model, self.nodes, self.basis = model, nodes, basis
+        self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
 
-    def full(self, coefficients: Floats) -> Floats:
-        if self._last is None or not np.array_equal(self._last, coefficients):
-            self._last = None  # a solve that fails leaves no state of these coefficients behind
-            self._displacement = self._model.solve((self._basis @ coefficients).reshape(-1, 3))
-            self._last = coefficients.copy()
-        return self._displacement
-
-    def solve_coefficients(self, coefficients: Floats) -> Floats:
-        return self.full(coefficients)[self._nodes]
-
-    def jacobian(self, coefficients: Floats) -> Floats:
-        self.full(coefficients)
-        return self._model.sensitivity(self._basis)[self._rows]
+    def solve(self, coefficients: Floats, near: _PickedState | None = None) -> _PickedState:
+        if near is not None and np.array_equal(near.coefficients, coefficients):
+            return near
+        forces = (self.basis @ coefficients).reshape(-1, 3)
+        return _PickedState(self, coefficients, self.model.solve(forces, None if near is None else near.full))
 
 
-def restrict(model: Any, nodes: Ints, basis: Floats) -> Restricted:
-    """A model from control coefficients to the displacement of some nodes.
+def reduce_model(model: Any, nodes: Ints, basis: Floats) -> ReducedModel:
+    """A model from force coefficients to the displacement of some nodes.
 
-    A model that has a `restricted` of its own (surrogates precompute products) is asked for it.
+    A model that has a `reduced` of its own (surrogates multiply beforehand) is asked for it.
 
     Args:
         model: a forward model.
         nodes: numbers of the nodes whose displacement is wanted, (p,).
-        basis: nodal forces of each coefficient, (3n, k).
+        basis: nodal forces of each coefficient, (3n, k), newtons.
     """
-    if hasattr(model, "restricted"):
-        return model.restricted(nodes, basis)
-    return _RestrictedModel(model, nodes, basis)
+    if hasattr(model, "reduced"):
+        found: ReducedModel = model.reduced(nodes, basis)
+        return found
+    return _PickedModel(model, nodes, basis)

@@ -133,10 +133,11 @@ def _predict(surrogate: Surrogate, data: DataSet, samples: Samples) -> tuple[Flo
     for i in range(len(samples)):
         forces[loaded] = samples.forces[i]
         began = time.perf_counter()
-        found[i] = surrogate.solve(forces)
+        state = surrogate.solve(forces)
         times[i] = time.perf_counter() - began
+        found[i] = state.displacement
         cotangent = probe_cotangents(data.body, data.shapes, samples.probes[i : i + 1])[0]
-        cosines[i] = cosine(surrogate.pullback(cotangent)[loaded], samples.adjoints[i])
+        cosines[i] = cosine(state.pull(cotangent)[loaded], samples.adjoints[i])
     return found, cosines, times
 
 
@@ -168,8 +169,7 @@ def registration_cosines(surrogate: Surrogate, data: DataSet, samples: Samples, 
     for i, (here, there) in enumerate(zip(samples.displacements, np.roll(samples.displacements, -1, 0), strict=True)):
         forces[loaded] = samples.forces[i]
         cotangent[boundary] = (here - there)[boundary]
-        surrogate.solve(forces)
-        cosines[i] = cosine(surrogate.pullback(cotangent)[loaded], adjoint(here, cotangent)[loaded])
+        cosines[i] = cosine(surrogate.solve(forces).pull(cotangent)[loaded], adjoint(here, cotangent)[loaded])
     return cosines
 
 

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
+from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
 from softtwin.reference.dataset import LinearResponse
@@ -70,6 +72,7 @@ class Frame:
         offset: (3n,), m.
         left: of the linear response, (3n, r), m; r = 0 for none.
         right: of the linear response, (r, 3l), 1/N; None for the identity.
+        spread: root mean square of each coordinate over the training loads, (d,); None where it was not measured.
     """
 
     loaded: Ints
@@ -78,6 +81,7 @@ class Frame:
     offset: Floats
     left: Floats
     right: Floats | None = None
+    spread: Floats | None = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What to store."""
@@ -87,6 +91,10 @@ class Frame:
     def linear(self, columns: Floats) -> Floats:
         """Linear part of the displacement, (3n, ...), for forces at the loaded nodes, (3l, ...)."""
         return self.left @ (columns if self.right is None else self.right @ columns)
+
+    def linear_rows(self, rows: Ints, columns: Floats) -> Floats:
+        """Some rows of `linear`, (p, k), without the others' price."""
+        return self.left[rows] @ (columns if self.right is None else self.right @ columns)
 
     def linear_adjoint(self, cotangent: Floats) -> Floats:
         """Linear part of the gradient, (3l,), for a gradient with respect to the displacement, (3n,)."""
@@ -100,8 +108,70 @@ def response_parts(response: LinearResponse) -> tuple[Floats, Floats | None]:
     return (left @ right, None) if len(right) >= right.shape[1] else (left, right)
 
 
+class SurrogateState:
+    """What a surrogate predicts under one load, with its derivatives: a value.
+
+    Args:
+        surrogate: the surrogate.
+        loads: forces at its loaded nodes, (3l,), newtons.
+    """
+
+    negative_pivots: int | None = None  # a network has no tangent to count them of
+
+    def __init__(self, surrogate: Surrogate, loads: Floats) -> None:
+        frame = surrogate.frame
+        self._surrogate = surrogate
+        self.coordinates = frame.encode @ loads
+        values, self._record = surrogate.core.evaluate(self.coordinates)
+        displacement = frame.offset + frame.linear(loads) + frame.decode @ values
+        self.displacement: Floats = displacement.reshape(-1, 3)
+
+    @property
+    def extent(self) -> float | None:
+        """How far the load lies out: 1 at the farthest load of the training; None where that was not measured.
+
+        The larger of two measures: the network's coordinates in units of their spread, and the largest displacement.
+        """
+        spread, domain = self._surrogate.frame.spread, self._surrogate.card.get("domain")
+        if spread is None or domain is None:
+            return None
+        far = np.sqrt(((self.coordinates / spread) ** 2).mean()) / domain["reach"]
+        moved = np.linalg.norm(self.displacement, axis=1).max() / domain["displacement_m"]
+        return float(max(far, moved))
+
+    def push(self, changes: ArrayLike) -> Floats:
+        """J B, (3n, k), for changes of the forces B, (3n, k).
+
+        Raises:
+            ValueError: another shape, numbers that are not finite, or changes at nodes that never carry load.
+        """
+        frame, core = self._surrogate.frame, self._surrogate.core
+        columns = self._surrogate.at_loaded("changes", changes)
+        inner = _tangent(core, self._record, frame.encode @ columns)
+        return frame.linear(columns) + frame.decode @ inner
+
+    def pull(self, cotangent: ArrayLike) -> Floats:
+        """Gradient with respect to the forces, (n, 3): J^T g, zero at nodes that never carry load.
+
+        Args:
+            cotangent: g, gradient with respect to the displacement, (n, 3), or several, (k, n, 3).
+
+        Raises:
+            ValueError: another shape, or numbers that are not finite.
+        """
+        given, shape = np.asarray(cotangent, dtype=np.float64), self.displacement.shape
+        if given.ndim == 3 and len(given):
+            return np.stack([self.pull(each) for each in given])
+        frame, core = self._surrogate.frame, self._surrogate.core
+        flat = checked_array("SurrogateState.cotangent", given, shape).ravel()
+        gradient = np.zeros_like(flat)
+        inner = core.pull(self._record, flat @ frame.decode)
+        gradient[self._surrogate.rows] = frame.linear_adjoint(flat) + inner @ frame.encode
+        return gradient.reshape(-1, 3)
+
+
 class Surrogate:
-    """A trained network as a forward model: frozen weights, derivatives at the last state.
+    """A trained network as a forward model with frozen weights.
 
     It satisfies what registration asks of a forward model and runs in double precision on the CPU.
 
@@ -117,16 +187,21 @@ class Surrogate:
         self.frame = frame
         self.core = core
         self.card: Mapping[str, Any] = MappingProxyType(dict(card))
-        self._loaded = (3 * frame.loaded[:, None] + np.arange(3)).ravel()
+        self.rows = (3 * frame.loaded[:, None] + np.arange(3)).ravel()
         self._idle = np.setdiff1d(np.arange(len(body.points)), np.union1d(frame.loaded, body.fixed))
-        self.reset()
 
-    def reset(self) -> None:
-        """Go back to rest: derivatives are those of zero forces until the next solve."""
-        self._record = self.core.evaluate(np.zeros(len(self.frame.encode)))[1]
+    @property
+    def error(self) -> float:
+        """Largest error of a node over the body, mean of the held-out samples, metres; 0 where it was not measured."""
+        held_out = self.card.get("held_out") or {}
+        return float(held_out.get("largest_error", {}).get("mean", 0.0))
 
-    def solve(self, forces: ArrayLike) -> Floats:
-        """Displacement, (n, 3) metres, under nodal forces, (n, 3) newtons.
+    def solve(self, forces: ArrayLike, near: Any = None) -> SurrogateState:
+        """The state under nodal forces, (n, 3) newtons.
+
+        Args:
+            forces: nodal forces, (n, 3), newtons.
+            near: of no use here; a network needs no start.
 
         Raises:
             ValueError: another shape, numbers that are not finite, or forces at nodes that the surrogate never saw
@@ -134,68 +209,42 @@ class Surrogate:
         """
         load = checked_array("Surrogate.forces", forces, self.body.points.shape)
         self._refuse_idle("forces", np.abs(load).max(axis=1))
-        loads = load.ravel()[self._loaded]
-        values, self._record = self.core.evaluate(self.frame.encode @ loads)
-        displacement = self.frame.offset + self.frame.linear(loads) + self.frame.decode @ values
-        return displacement.reshape(-1, 3)
+        return SurrogateState(self, load.ravel()[self.rows])
 
-    def pullback(self, cotangent: ArrayLike) -> Floats:
-        """Gradient with respect to the forces, (n, 3): J^T g at the last state, zero at nodes that never carry load.
-
-        Args:
-            cotangent: g, gradient with respect to the displacement, (n, 3).
-
-        Raises:
-            ValueError: another shape, or numbers that are not finite.
-        """
-        flat = checked_array("Surrogate.cotangent", cotangent, self.body.points.shape).ravel()
-        inner = self.core.pull(self._record, flat @ self.frame.decode)
-        gradient = np.zeros_like(flat)
-        gradient[self._loaded] = self.frame.linear_adjoint(flat) + inner @ self.frame.encode
-        return gradient.reshape(-1, 3)
-
-    def sensitivity(self, columns: ArrayLike) -> Floats:
-        """J B, (3n, k), at the last state for changes of the forces B, (3n, k).
-
-        Raises:
-            ValueError: another shape, numbers that are not finite, or changes at nodes that never carry load.
-        """
-        changes = self._checked_columns("columns", columns)[self._loaded]
-        inner = _tangent(self.core, self._record, self.frame.encode @ changes)
-        return self.frame.linear(changes) + self.frame.decode @ inner
-
-    def restricted(self, rows: ArrayLike, columns: ArrayLike) -> Restricted:
+    def reduced(self, nodes: ArrayLike, basis: ArrayLike) -> ReducedSurrogate:
         """The surrogate between a few force coefficients and a few nodes, all that can be computed before computed.
 
         Args:
-            rows: numbers of the nodes whose displacement is wanted, (p,).
-            columns: force basis B, (3n, k), newtons; the forces are B c for coefficients c.
+            nodes: numbers of the nodes whose displacement is wanted, (p,).
+            basis: force basis B, (3n, k), newtons; the forces are B c for coefficients c.
 
         Raises:
-            ValueError: node numbers out of range, or a basis as `sensitivity` refuses it.
+            ValueError: node numbers out of range, or a basis as `SurrogateState.push` refuses it.
         """
-        nodes = np.asarray(rows)
-        if nodes.ndim != 1 or not np.issubdtype(nodes.dtype, np.integer):
-            raise ValueError(f"rows: expected node numbers of shape (p,), got {nodes.dtype} of shape {nodes.shape}.")
-        if len(nodes) and (nodes.min() < 0 or nodes.max() >= len(self.body.points)):
-            raise ValueError(f"rows: expected 0..{len(self.body.points) - 1}, got {nodes.min()}..{nodes.max()}.")
-        basis = self._checked_columns("columns", columns)[self._loaded]
-        picked = (3 * nodes[:, None] + np.arange(3)).ravel()
-        linear = self.frame.linear(basis)
-        return Restricted(self.core, self.frame.encode @ basis, linear, self.frame.decode, self.frame.offset, picked)
+        chosen = np.asarray(nodes)
+        if chosen.ndim != 1 or not np.issubdtype(chosen.dtype, np.integer):
+            raise ValueError(f"nodes: expected numbers of shape (p,), got {chosen.dtype} of shape {chosen.shape}.")
+        if len(chosen) and (chosen.min() < 0 or chosen.max() >= len(self.body.points)):
+            raise ValueError(f"nodes: expected 0..{len(self.body.points) - 1}, got {chosen.min()}..{chosen.max()}.")
+        return ReducedSurrogate(self, chosen, self.at_loaded("basis", basis))
 
     def with_card(self, **entries: Any) -> Surrogate:
         """The same surrogate with more entries in its card, for instance held-out errors."""
         return Surrogate(self.body, self.frame, self.core, {**self.card, **entries})
 
-    def _checked_columns(self, name: str, columns: ArrayLike) -> Floats:
+    def at_loaded(self, name: str, columns: ArrayLike) -> Floats:
+        """Columns of nodal forces (3n, k) at the loaded nodes, (3l, k).
+
+        Raises:
+            ValueError: another shape, numbers that are not finite, or forces at nodes that never carry load.
+        """
         array = np.asarray(columns, dtype=np.float64)
         expected = self.body.points.size
         if array.ndim != 2 or array.shape[0] != expected:
             raise ValueError(f"Surrogate.{name}: expected shape ({expected}, k), got {array.shape}.")
         checked_array(f"Surrogate.{name}", array, array.shape)
         self._refuse_idle(name, np.abs(array).reshape(-1, 3 * array.shape[1]).max(axis=1, initial=0.0))
-        return array
+        return array[self.rows]
 
     def _refuse_idle(self, name: str, sizes: Floats) -> None:
         bad = self._idle[sizes[self._idle] > 0.0]
@@ -213,67 +262,66 @@ def _tangent(core: Core, record: Any, columns: Floats) -> Floats:
     return core.push(record, columns)
 
 
-class Restricted:
-    """A surrogate between force coefficients and the displacement of a few nodes, made by `Surrogate.restricted`.
+class ReducedSurrogateState:
+    """What a reduced surrogate predicts for one set of coefficients: a value.
 
     Args:
-        core: the network.
-        encode: its coordinates for unit coefficients, (d, k).
-        linear: linear displacement for unit coefficients, (3n, k).
-        decode: displacement for unit values of the network, (3n, e).
-        offset: displacement that is always there, (3n,).
-        picked: numbers of the wanted components, (3p,).
+        model: the reduced surrogate.
+        coefficients: (k,).
     """
 
-    def __init__(
-        self, core: Core, encode: Floats, linear: Floats, decode: Floats, offset: Floats, picked: Ints
-    ) -> None:
-        self._core = core
-        self._encode, self._linear, self._decode, self._offset = encode, linear, decode, offset
-        self._linear_rows, self._decode_rows, self._offset_rows = linear[picked], decode[picked], offset[picked]
+    def __init__(self, model: ReducedSurrogate, coefficients: Floats) -> None:
+        self._model, self.coefficients = model, coefficients
+        self._values, self._record = model.surrogate.core.evaluate(model.encode @ coefficients)
+        rows = model.offset_rows + model.linear_rows @ coefficients + model.decode_rows @ self._values
+        self.positions: Floats = rows.reshape(-1, 3)
 
-    @property
-    def coefficient_count(self) -> int:
-        """Number of force coefficients, k."""
-        return self._encode.shape[1]
+    @cached_property
+    def full(self) -> SurrogateState:
+        """The whole state."""
+        return SurrogateState(self._model.surrogate, self._model.basis @ self.coefficients)
 
-    def solve_coefficients(self, coefficients: ArrayLike) -> Floats:
-        """Displacement of the wanted nodes, (p, 3) metres, for force coefficients, (k,)."""
-        c = self._checked(coefficients)
-        values, _ = self._core.evaluate(self._encode @ c)
-        return self._rows(c, values)
+    @cached_property
+    def _tangent(self) -> Floats:
+        return _tangent(self._model.surrogate.core, self._record, self._model.encode)
 
-    def jacobian(self, coefficients: ArrayLike) -> Floats:
-        """Derivative of the wanted displacements with respect to the coefficients, (3p, k), metres per unit."""
-        return self.evaluate(coefficients)[1]
+    def jacobian(self, rows: csr_array) -> Floats:
+        """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p); no more is touched."""
+        return rows @ self._model.linear_rows + (rows @ self._model.decode_rows) @ self._tangent
 
-    def evaluate(self, coefficients: ArrayLike) -> tuple[Floats, Floats]:
-        """Displacement, (p, 3), and its derivative, (3p, k), for little more than the price of the derivative."""
-        c = self._checked(coefficients)
-        values, record = self._core.evaluate(self._encode @ c)
-        jacobian = self._linear_rows + self._decode_rows @ _tangent(self._core, record, self._encode)
-        return self._rows(c, values), jacobian
+    def moved(self, change: Floats) -> Floats:
+        """First-order displacement of the chosen nodes, (p, 3), for a change of the coefficients, (k,)."""
+        return (self._model.linear_rows @ change + self._model.decode_rows @ (self._tangent @ change)).reshape(-1, 3)
 
-    def gradient(self, coefficients: ArrayLike, cotangent: ArrayLike) -> Floats:
-        """Gradient with respect to the coefficients, (k,), for one with respect to the wanted displacements, (p, 3)."""
-        g = np.asarray(cotangent, dtype=np.float64).ravel()
-        _, record = self._core.evaluate(self._encode @ self._checked(coefficients))
-        return g @ self._linear_rows + self._core.pull(record, g @ self._decode_rows) @ self._encode
 
-    def full(self, coefficients: ArrayLike) -> Floats:
-        """Displacement of all nodes, (n, 3) metres, for force coefficients, (k,)."""
-        c = self._checked(coefficients)
-        values, _ = self._core.evaluate(self._encode @ c)
-        return (self._offset + self._linear @ c + self._decode @ values).reshape(-1, 3)
+class ReducedSurrogate:
+    """A surrogate between force coefficients and the displacement of a few nodes, made by `Surrogate.reduced`.
 
-    def _rows(self, c: Floats, values: Floats) -> Floats:
-        return (self._offset_rows + self._linear_rows @ c + self._decode_rows @ values).reshape(-1, 3)
+    Args:
+        surrogate: the surrogate.
+        nodes: numbers of the wanted nodes, (p,).
+        basis: forces at the loaded nodes for unit coefficients, (3l, k), newtons.
+    """
 
-    def _checked(self, coefficients: ArrayLike) -> Floats:
+    def __init__(self, surrogate: Surrogate, nodes: Ints, basis: Floats) -> None:
+        frame = surrogate.frame
+        picked = (3 * nodes[:, None] + np.arange(3)).ravel()
+        self.surrogate, self.basis = surrogate, basis
+        self.encode = frame.encode @ basis
+        self.linear_rows = frame.linear_rows(picked, basis)
+        self.decode_rows = np.ascontiguousarray(frame.decode[picked])
+        self.offset_rows = frame.offset[picked]
+
+    def solve(self, coefficients: ArrayLike, near: Any = None) -> ReducedSurrogateState:
+        """The state for force coefficients, (k,); `near` is of no use here.
+
+        Raises:
+            ValueError: another shape.
+        """
         c = np.asarray(coefficients, dtype=np.float64)
-        if c.shape != (self.coefficient_count,):
-            raise ValueError(f"coefficients: expected shape ({self.coefficient_count},), got {c.shape}.")
-        return c
+        if c.shape != (self.encode.shape[1],):
+            raise ValueError(f"coefficients: expected shape ({self.encode.shape[1]},), got {c.shape}.")
+        return ReducedSurrogateState(self, c)
 
 
 # ------------------------------------------------------------------ on disk

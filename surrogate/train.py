@@ -11,7 +11,7 @@ import threading
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -36,6 +36,8 @@ Lesson = ReducedLesson | PerceptronLesson
 CHECKPOINT = "training.ckpt"
 ROUNDS = 40  # a round ends with a look at the validation split and a checkpoint
 _WARM_UP = 200  # steps over which the learning rate rises
+_WARM_TENTHS = 10.0
+_ENDLESS = 10**9  # steps of a round that the clock ends
 _RATES = {"reduced": 3e-3, "mlp": 1e-3}
 _BATCHES = {"reduced": 128, "mlp": 50}
 
@@ -45,7 +47,7 @@ class CheckpointError(ValueError):
 
 
 class Diverged(RuntimeError):  # noqa: N818 - a way to end, as NotConverged is
-    """Training that produced no finite validation error: the message says what to try."""
+    """Training whose validation error is no finite number any more: the message says what to try."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,9 @@ class TrainingPlan:
         modes: POD modes of the reduced network at most.
         width: width of its blocks.
         depth: number of its blocks.
-        seconds: time to train for; the number of steps is fixed at the start from the measured time of a step.
+        seconds: wall time of the steps, the looks at the validation split and the checkpoints together. The clock is
+            looked at before every step, so that training ends with the step that is under way when the time is over,
+            on a busy machine too (with fewer steps then). Reading the data and finding the modes come before it.
         epochs: passes over the training samples; given, it replaces `seconds`.
         batch: samples a step; None for the architecture's own: 128, or 50 for the perceptron (thesis: ten to fifty).
         learning_rate: highest of the cosine; None for the architecture's own: 3e-3, or 1e-3 for the perceptron.
@@ -107,27 +111,30 @@ class TrainingPlan:
         return min(self.batch or _BATCHES[self.architecture], count)
 
 
-def train(data: DataSet, plan: TrainingPlan, folder: Path | str | None = None) -> Surrogate:
+def train(
+    data: DataSet, plan: TrainingPlan, folder: Path | str | None = None, clock: Callable[[], float] = time.monotonic
+) -> Surrogate:
     """A surrogate trained on the training split, its weights the best on the validation split.
 
-    The test split is not read. With a folder, training that was interrupted goes on from its last round; batches
-    depend on the seed and the round alone, so that it ends where an undisturbed run on the same machine does.
+    The test split is not read. With a folder, training that was interrupted goes on from its last round, with the
+    epochs or seconds that are left; batches depend on the seed and the round alone, so that a training by epochs
+    ends where an undisturbed run on the same machine does.
 
     Args:
         data: the data set.
         plan: what to train.
         folder: for the checkpoint; None for none that outlasts the call.
+        clock: seconds since whenever; `plan.seconds` is measured with it.
 
     Raises:
         CheckpointError: the folder's checkpoint is truncated, or of another plan or data set.
         DataSetError: the training or validation split is not complete.
-        Diverged: no round ended with a finite validation error.
-        ValueError: a split holds no accepted sample.
+        Diverged: the validation error is no finite number any more.
+        ValueError: a split holds no accepted sample, or numbers that are not finite.
     """
     splits = {"train": data.samples("train", plan.samples), "validation": data.samples("validation")}
     for name, samples in splits.items():
-        if len(samples) == 0:
-            raise ValueError(f"train.data: expected accepted samples in the {name} split of {data.path}, got none.")
+        _check_split(data, name, samples)
     mark = fingerprint(data, splits)
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(folder or temporary) / CHECKPOINT
@@ -135,16 +142,25 @@ def train(data: DataSet, plan: TrainingPlan, folder: Path | str | None = None) -
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(plan.seed)
             lesson = _build_lesson(data, plan, splits).to(_device())
-        steps = resumed["steps"] if resumed else _count_steps(lesson, plan)
-        course = Course(lesson, plan, mark, steps)
-        _fit(course, path, resumed is not None)
-    if not course.best:
-        raise Diverged(
-            f"train: no finite validation error in {steps} steps at learning rate {plan.rate}; "
-            "lower TrainingPlan.learning_rate."
-        )
+        course = Course(lesson, plan, mark, clock)
+        if resumed:
+            course.take_back(resumed)
+        if course.share < 1.0:
+            _fit(course, path, resumed is not None)
     lesson.network.load_state_dict(course.best)
     return _surrogate(lesson, data, _card(data, plan, splits, course))
+
+
+def _check_split(data: DataSet, name: str, samples: Samples) -> None:
+    if len(samples) == 0:
+        raise ValueError(f"train.data: expected accepted samples in the {name} split of {data.path}, got none.")
+    arrays = (samples.forces, samples.displacements, samples.probes, samples.adjoints)
+    wrong = sum(not all(np.isfinite(array[i]).all() for array in arrays) for i in range(len(samples)))
+    if wrong:
+        raise ValueError(
+            f"train.data: expected finite numbers in the {name} split of {data.path}, got {wrong} of {len(samples)} "
+            "samples with others; make the data set again with smaller loads."
+        )
 
 
 def _device() -> str:
@@ -180,39 +196,29 @@ def fingerprint(data: DataSet, splits: dict[str, Samples]) -> str:
 # ------------------------------------------------------------------ how long
 
 
-def _count_steps(lesson: Lesson, plan: TrainingPlan) -> int:
-    """Steps of the whole training, a multiple of the steps of a round."""
-    batch = plan.batch_size(lesson.sample_count)
-    if plan.epochs is not None:
-        wanted = math.ceil(plan.epochs * lesson.sample_count / batch)
-    else:
-        wanted = max(1, int(plan.seconds / _step_time(lesson, plan, batch)))
+def _count_steps(plan: TrainingPlan, sample_count: int) -> int | None:
+    """Steps of a training by epochs, a multiple of the steps of a round; None where the clock ends it."""
+    if plan.epochs is None:
+        return None
+    wanted = math.ceil(plan.epochs * sample_count / plan.batch_size(sample_count))
     rounds = min(ROUNDS, wanted)
     return math.ceil(wanted / rounds) * rounds
 
 
-def _step_time(lesson: Lesson, plan: TrainingPlan, batch: int) -> float:
-    """Seconds of a training step, the median of some; the weights are put back."""
-    start = {name: value.clone() for name, value in lesson.network.state_dict().items()}
-    optimizer = _optimizer(lesson, plan, rate=1e-9)
-    numbers = torch.arange(batch, device=next(lesson.network.parameters()).device)
-    times: list[float] = []
-    end = time.perf_counter() + min(3.0, 0.05 * plan.seconds)
-    while len(times) < 8 or (time.perf_counter() < end and len(times) < 200):
-        began = time.perf_counter()
-        optimizer.zero_grad()
-        loss = lesson.loss(numbers)
-        loss.backward()
-        optimizer.step()
-        float(loss.detach())  # waits for an accelerator
-        times.append(time.perf_counter() - began)
-    lesson.network.load_state_dict(start)
-    return float(np.median(times[3:]))
+def rate_factor(step: int, share: float) -> float:
+    """Part of the highest learning rate: a warm-up, then a cosine down to zero at the end of the budget.
+
+    Args:
+        step: steps that were made.
+        share: part of the epochs or seconds that were used, 0 to 1.
+    """
+    warm = max((step + 1) / _WARM_UP, _WARM_TENTHS * share)  # 200 steps, or a tenth of a training that is shorter
+    return min(1.0, warm) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, share)))
 
 
-def _optimizer(lesson: Lesson, plan: TrainingPlan, rate: float) -> torch.optim.Optimizer:
+def _optimizer(lesson: Lesson, plan: TrainingPlan) -> torch.optim.Optimizer:
     kind = torch.optim.Adam if plan.architecture == "mlp" else torch.optim.AdamW
-    return kind(lesson.network.parameters(), lr=rate, fused=True)
+    return kind(lesson.network.parameters(), lr=plan.rate, fused=True)
 
 
 @dataclass(frozen=True)
@@ -238,9 +244,12 @@ class Batches:
 
     def __iter__(self) -> Iterator[Tensor]:
         rng = np.random.default_rng([self.seed, self.number])
-        passes = math.ceil(self.steps * self.batch / self.count)
-        numbers = np.concatenate([rng.permutation(self.count) for _ in range(passes)])
-        return iter(torch.from_numpy(numbers[: self.steps * self.batch]).split(self.batch))
+        waiting = np.empty(0, dtype=np.int64)
+        for _ in range(self.steps):
+            while len(waiting) < self.batch:
+                waiting = np.concatenate([waiting, rng.permutation(self.count)])
+            yield torch.from_numpy(waiting[: self.batch])
+            waiting = waiting[self.batch :]
 
 
 # ------------------------------------------------------------------ Lightning
@@ -249,42 +258,60 @@ class Batches:
 class Course(lightning.LightningModule):
     """A lesson under Lightning: one epoch is a round; the best weights on the validation split are kept.
 
+    A round is a part of the steps, or of the time by the clock; it holds at least one step.
+
     Args:
         lesson: network, data and loss.
         plan: how to train.
         mark: fingerprint of the data.
-        steps: optimiser steps of the whole training, a multiple of the number of rounds.
+        clock: seconds since whenever.
     """
 
-    def __init__(self, lesson: Lesson, plan: TrainingPlan, mark: str, steps: int) -> None:
+    def __init__(
+        self, lesson: Lesson, plan: TrainingPlan, mark: str, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         super().__init__()
         self.lesson = lesson
-        self.plan, self.mark, self.steps = plan, mark, steps
-        self.rounds = min(ROUNDS, steps)
+        self.plan, self.mark, self.clock = plan, mark, clock
+        self.steps = _count_steps(plan, lesson.sample_count)
+        self.rounds = ROUNDS if self.steps is None else min(ROUNDS, self.steps)
         self.best: dict[str, Tensor] = {}
         self.best_error = math.inf
         self.seconds = 0.0
+        self.steps_made = 0
+
+    @property
+    def share(self) -> float:
+        """Part of the epochs or seconds that were used, as far as the clock was looked at."""
+        return self.seconds / self.plan.seconds if self.steps is None else self.steps_made / self.steps
 
     def configure_optimizers(self) -> Any:
-        """AdamW (Adam for the perceptron) with a short warm-up and a cosine down to zero, step by step."""
-        optimizer = _optimizer(self.lesson, self.plan, self.plan.rate)
-        warm = min(_WARM_UP, max(1, self.steps // 10))
-
-        def factor(step: int) -> float:
-            return min(1.0, (step + 1) / warm) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / self.steps)))
-
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        """AdamW (Adam for the perceptron); its rate is set before every step."""
+        return _optimizer(self.lesson, self.plan)
 
     def train_dataloader(self) -> Batches:
         """Sample numbers of the steps of the current round."""
         count = self.lesson.sample_count
-        steps = self.steps // self.rounds
+        steps = _ENDLESS if self.steps is None else self.steps // self.rounds
         return Batches(count, self.plan.batch_size(count), steps, self.plan.seed, self.current_epoch)
 
+    def on_train_start(self) -> None:
+        """Start the clock, where an interrupted training left it."""
+        self._origin = self.clock() - self.seconds
+
     def on_train_epoch_start(self) -> None:
-        """Start the round's clock."""
-        self._began = time.perf_counter()
+        """Find where the round ends: at the next part of the time; batches end the others."""
+        self._round_end = math.inf if self.steps is not None else (math.floor(ROUNDS * self.share) + 1) / ROUNDS
+
+    def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> int | None:
+        """Look at the clock: -1 ends the round, else the step gets its learning rate."""
+        self._look()
+        over = self.share >= 1.0 and self.steps_made > 0
+        if over or (batch_idx > 0 and self.share >= self._round_end):
+            return -1
+        for group in self.trainer.optimizers[0].param_groups:
+            group["lr"] = self.plan.rate * rate_factor(self.steps_made, self.share)
+        return None
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
         """Loss of one batch."""
@@ -292,18 +319,29 @@ class Course(lightning.LightningModule):
 
     def on_train_epoch_end(self) -> None:
         """Look at the validation split and keep the weights if they are the best so far."""
-        self.seconds += time.perf_counter() - self._began
-        self.error = self.lesson.error()
-        if self.error < self.best_error:
-            self.best_error = self.error
+        error = self.lesson.error()
+        self._look()
+        if not math.isfinite(error):
+            raise Diverged(
+                f"train: the validation error is {error} after {self.steps_made} steps at learning rate "
+                f"{self.plan.rate}; lower TrainingPlan.learning_rate."
+            )
+        if error < self.best_error:
+            self.best_error = error
             self.best = {name: value.detach().clone() for name, value in self.lesson.network.state_dict().items()}
+        if self.share >= 1.0:
+            self.trainer.should_stop = True
+
+    def _look(self) -> None:
+        self.seconds = self.clock() - self._origin
+        self.steps_made = self.trainer.global_step
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what Lightning does not know of."""
         checkpoint["course"] = {
             "plan": asdict(self.plan),
             "data": self.mark,
-            "steps": self.steps,
+            "steps_made": self.steps_made,
             "best": self.best,
             "best_error": self.best_error,
             "seconds": self.seconds,
@@ -311,22 +349,31 @@ class Course(lightning.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take it back."""
-        course = checkpoint["course"]
-        self.best, self.best_error, self.seconds = course["best"], course["best_error"], course["seconds"]
+        self.take_back(checkpoint["course"])
+
+    def take_back(self, course: dict[str, Any]) -> None:
+        """Go on from what `on_save_checkpoint` added."""
+        for name in ("best", "best_error", "seconds", "steps_made"):
+            setattr(self, name, course[name])
 
 
 class _Progress(Callback):
-    """One bar over all steps: rate, time left, validation error; quiet when not a terminal."""
+    """One bar over the steps or the seconds: time left, validation error; quiet when not a terminal."""
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: Any) -> None:
-        self._bar = tqdm(total=pl_module.steps, initial=trainer.global_step, desc="training", unit="step", disable=None)
+        by_clock = pl_module.steps is None
+        layout = "{desc}: {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s{postfix}" if by_clock else None
+        total = pl_module.plan.seconds if by_clock else pl_module.steps
+        self._bar = tqdm(total=total, desc="training", unit="step", bar_format=layout, disable=None)
 
     def on_train_batch_end(self, trainer: lightning.Trainer, pl_module: Any, *_: Any) -> None:
-        self._bar.update()
+        used = trainer.global_step if pl_module.steps is not None else min(pl_module.seconds, self._bar.total or 0.0)
+        self._bar.update(used - self._bar.n)
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, pl_module: Any) -> None:
         if pl_module.best:
-            self._bar.set_postfix_str(f"validation {pl_module.best_error:.3g}", refresh=False)
+            said = f", step {trainer.global_step}, validation {pl_module.best_error:.3g}"
+            self._bar.set_postfix_str(said, refresh=False)
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module: Any) -> None:
         self._bar.close()
@@ -397,6 +444,8 @@ def _interruptible() -> Iterator[None]:
 def _read_checkpoint(path: Path, plan: TrainingPlan, mark: str) -> dict[str, Any]:
     try:
         course: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)["course"]
+        if "steps_made" not in course:
+            raise KeyError("steps_made")
     except Exception as error:  # a damaged file fails in whichever layer reads it: zip, pickle, or the keys
         raise CheckpointError(
             f"train.folder: {path} cannot be read ({type(error).__name__}); it is truncated or no checkpoint of "
@@ -407,10 +456,13 @@ def _read_checkpoint(path: Path, plan: TrainingPlan, mark: str) -> dict[str, Any
     if differing:
         raise CheckpointError(
             f"train.folder: {path} belongs to another plan (differs in {', '.join(differing)}); choose another folder, "
-            "or the plan it was made with to go on."
+            "the plan it was made with to go on, or train from the start (`softtwin train --fresh`)."
         )
     if course["data"] != mark:
-        raise CheckpointError(f"train.folder: {path} belongs to another data set; choose another folder.")
+        raise CheckpointError(
+            f"train.folder: {path} belongs to another data set; choose another folder, or train "
+            "from the start (`softtwin train --fresh`)."
+        )
     return course
 
 
@@ -439,13 +491,14 @@ def _card(data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], course:
         "data": {
             "path": str(data.path),
             "fingerprint": course.mark,
+            "identity": data.identity,
             "versions": data.header.get("versions", {}),
             "plan": data.header.get("plan", {}),
         },
         "samples": {**{name: len(samples) for name, samples in splits.items()}, "rejected": dict(rejected)},
         "training": {
             "parameters": sum(p.numel() for p in course.lesson.network.parameters()),
-            "steps": course.steps,
+            "steps": course.steps_made,
             "seconds": course.seconds,
             "validation_error": course.best_error,
             "device": _device(),

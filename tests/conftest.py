@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -14,7 +15,10 @@ from softtwin.meshes.shapes import beam
 
 LIVER = Path(__file__).parents[2] / "shared" / "data" / "liver"
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does: else tests on busy cores crawl
+
+for folder in ("benchmarks", "examples"):
+    sys.path.insert(0, str(Path(__file__).parents[1] / folder))
 
 
 @pytest.fixture(scope="session")
@@ -46,6 +50,20 @@ def mpi_environment() -> dict[str, str]:
         "PRTE_MCA_hwloc_default_binding_policy": "none",
         "OPENBLAS_NUM_THREADS": "1",
     }
+
+
+@pytest.fixture(scope="session")
+def small_quickstart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished small quickstart, run as a user runs it; who changes it takes a copy."""
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    pytest.importorskip("torch", reason="torch is absent")
+    folder = tmp_path_factory.mktemp("quickstart") / "out"
+    command = [sys.executable, "-m", "softtwin.app.cli", "quickstart", "--small", "--output", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (folder / "said.txt").write_text(done.stdout)
+    (folder / "complained.txt").write_text(done.stderr)
+    return folder
 
 
 @pytest.fixture

@@ -2,58 +2,54 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+import time
+from collections.abc import Sequence
+from pathlib import Path
 
-from softtwin.meshes.files import read_body
+from softtwin.meshes.body import Body
 from softtwin.reference.dataset import DataSet
-from softtwin.reference.loads import LoadPlan
+from softtwin.reference.ranks import on_first
 
-from ..config import Config, ConfigError
-from ..workspace import Workspace, timed
-
-
-def load_plan(config: Config) -> LoadPlan:
-    """How loads are drawn, from the configuration."""
-    loads = config.loads
-    return LoadPlan(
-        kind=loads.kind,
-        modes=loads.modes,
-        zones=loads.zones,
-        patches=loads.patches,
-        radius=loads.radius,
-        displacement=loads.displacement,
-        amplitude=loads.amplitude or None,
-    )
+from ..inputs import current_body, generate_inputs, plan_entries
+from ..workspace import Workspace, open_workspace, record_stage
 
 
-def generate_stage(space: Workspace, redo: tuple[int, ...] = ()) -> DataSet | None:
+def generate_stage(configuration: Path, redo: Sequence[int] = (), again: bool = False) -> DataSet | None:
     """Solve the equilibria of the data set; collective where mpirun started it. Returns None on ranks other than 0.
 
-    Raises:
-        ConfigError: there is no body yet.
-        DataSetError: the folder holds a data set of another configuration.
-    """
-    from softtwin.reference.dataset import drop_block  # FEniCSx is needed by this stage alone
-    from softtwin.reference.equilibrium import NewtonOptions
-    from softtwin.reference.fenicsx import MPI
-    from softtwin.reference.generate import Plan, generate
+    Args:
+        configuration: the configuration file, read on rank 0 alone.
+        redo: numbers of blocks to make again.
+        again: throw away what is there.
 
-    if not space.body.exists():
-        raise ConfigError(f"generate: expected the body in {space.body}, found none; run `softtwin mesh` first.")
-    samples, material = space.config.samples, space.config.material
-    plan = Plan(
-        material=material.law,
-        young_modulus=material.young_modulus,
-        poisson_ratio=material.poisson_ratio,
-        loads=load_plan(space.config),
-        samples={"train": samples.train, "validation": samples.validation, "test": samples.test},
-        block=samples.block,
-        path=samples.path,
-        seed=samples.seed,
-        newton=NewtonOptions(**space.config.solver.model_dump()),
-    )
-    if MPI.COMM_WORLD.rank == 0:
-        for block in redo:
-            drop_block(space.data, block)
-    with timed(space, "generate") if MPI.COMM_WORLD.rank == 0 else nullcontext():
-        return generate(space.data, read_body(space.body), plan)
+    Raises:
+        ConfigError: there is no body yet, or one of another configuration.
+        DataSetError: the folder holds a data set of another configuration, or somebody else writes it.
+        FailedElsewhere: on the other ranks, where rank 0 raises one of these.
+    """
+    from softtwin.reference.fenicsx import MPI  # FEniCSx is needed by this stage alone
+    from softtwin.reference.generate import generate, plan_from_header
+
+    comm, begin = MPI.COMM_WORLD, time.perf_counter()
+    asked = on_first(comm, lambda: _read(configuration))
+    if asked is None:
+        return generate(None, None, None, comm)
+    space, body = asked
+    plan = plan_from_header({"plan": plan_entries(space.config)})
+    data = generate(space.data, body, plan, comm, redo, again)
+    record_stage(space, "generate", time.perf_counter() - begin, generate_inputs(space, body))
+    return data
+
+
+def describe_data(data: DataSet) -> str:
+    """Counts of accepted and rejected draws, with the reasons of the rejected."""
+    rejected = data.rejected()
+    counts = {reason: rejected.reasons.count(reason) for reason in sorted(set(rejected.reasons))}
+    total = sum(data.header["samples"].values())
+    because = f" ({', '.join(f'{count} {reason}' for reason, count in counts.items())})" if counts else ""
+    return f"{total - len(rejected.draws)} equilibria accepted, {len(rejected.draws)} rejected{because}"
+
+
+def _read(configuration: Path) -> tuple[Workspace, Body]:
+    space = open_workspace(configuration)
+    return space, current_body(space)

@@ -3,41 +3,54 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 
 import numpy as np
 
-from softtwin.meshes.files import read_body
 from softtwin.meshes.metrics import nodal_distances
 from softtwin.reference.dataset import DataSet
+from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.predictor import Surrogate, load, save
 from softtwin.surrogate.train import TrainingPlan, train
 
 from ..config import to_toml
-from ..workspace import Workspace, timed
+from ..inputs import check_trained, current_data, train_inputs, validate_inputs
+from ..workspace import Workspace, timed, write_whole
 
 
-def train_stage(space: Workspace) -> Surrogate:
+def train_stage(space: Workspace, fresh: bool = False) -> Surrogate:
     """Train on the data set and write the twin: body, weights, card, configuration. Goes on from the last checkpoint.
 
+    Args:
+        space: the workspace.
+        fresh: throw earlier checkpoints away instead.
+
     Raises:
-        DataSetError: the data set is missing, damaged or not complete.
+        ConfigError: there is no body, or one of another configuration.
+        DataSetError: the data set is missing, damaged, not complete, or of another body or configuration.
         CheckpointError: the checkpoint is truncated, or of another plan or data set.
     """
+    data, _ = current_data(space)
+    if fresh:
+        shutil.rmtree(space.training, ignore_errors=True)
     section = space.config.training
     plan = TrainingPlan(
         architecture=section.architecture,
         modes=section.modes,
         width=section.width,
         seconds=section.seconds,
+        epochs=section.epochs or None,
         seed=section.seed,
     )
-    with timed(space, "train"):
-        surrogate = train(DataSet(space.data), plan, space.training)
+    with timed(space, "train", train_inputs(space, data)):
+        surrogate = with_domain(train(data, plan, space.training), data)
         save(surrogate, space.twin)
-    shutil.copyfile(space.body, space.twin / "body.vtu")
-    (space.twin / "organ.toml").write_text(to_toml(space.config))
+        partial = space.twin / ".body.vtu.partial"
+        shutil.copyfile(space.body, partial)
+        os.replace(partial, space.twin / "body.vtu")
+        write_whole(space.twin / "organ.toml", to_toml(space.config))
     return surrogate
 
 
@@ -46,16 +59,19 @@ def validate_stage(space: Workspace) -> str:
 
     Raises:
         TwinError: the twin is missing, damaged or of another body.
-        DataSetError: the held-out samples are not complete.
+        ConfigError: it was trained otherwise than the configuration says, or on other data.
+        DataSetError: the held-out samples are not complete, or of another body or configuration.
     """
-    data = DataSet(space.data)
-    with timed(space, "validate"):
-        surrogate = load(space.twin, read_body(space.body))
+    data, body = current_data(space)
+    surrogate = load(space.twin, body)
+    check_trained(space, data, surrogate.card)
+    with timed(space, "validate", validate_inputs(space, data)):
         evaluation = evaluate(surrogate, data)
         _write_predictions(space, surrogate, data)
-    figures = evaluation.as_dict()
-    (space.folder / "validation.json").write_text(json.dumps({"table": str(evaluation), "figures": figures}, indent=1))
-    save(surrogate.with_card(held_out=figures), space.twin)
+        figures = evaluation.as_dict()
+        table = json.dumps({"table": str(evaluation), "figures": figures}, indent=1)
+        write_whole(space.folder / "validation.json", table)
+        save(surrogate.with_card(held_out=figures), space.twin)
     return str(evaluation)
 
 
@@ -66,14 +82,16 @@ def _write_predictions(space: Workspace, surrogate: Surrogate, data: DataSet) ->
     for i, loads in enumerate(samples.forces):
         forces = np.zeros_like(data.body.points)
         forces[data.response.loaded] = loads
-        predicted[i] = surrogate.solve(forces)
+        predicted[i] = surrogate.solve(forces).displacement
     errors = nodal_distances(predicted, samples.displacements).mean(axis=1)
     order = np.argsort(errors)
     shown = order[[len(order) // 2, -1]]
+    partial = space.folder / ".validation.partial.npz"
     np.savez(
-        space.folder / "validation.npz",
+        partial,
         displacements_true=samples.displacements[shown],
         displacements_predicted=predicted[shown],
         errors_mean_m=errors,
         sizes_m=np.linalg.norm(samples.displacements, axis=2).max(axis=1),
     )
+    os.replace(partial, space.folder / "validation.npz")

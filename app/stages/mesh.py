@@ -6,8 +6,9 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.files import write_body
 from softtwin.meshes.metrics import mesh_quality
 
+from ..inputs import mesh_inputs
 from ..organ import make_organ
-from ..workspace import Workspace, timed
+from ..workspace import Workspace, timed, write_whole
 
 
 def mesh_stage(space: Workspace) -> Body:
@@ -17,9 +18,9 @@ def mesh_stage(space: Workspace) -> Body:
         FileError, SurfaceError, BodyError, ConfigError: what is wrong with the input.
     """
     space.folder.mkdir(parents=True, exist_ok=True)
-    with timed(space, "mesh"):
+    with timed(space, "mesh", mesh_inputs(space)):
         organ = make_organ(space.config.body, space.root)
         write_body(space.body, organ.body)
         lines = [str(mesh_quality(organ.body)), *organ.notes]
-        (space.folder / "mesh_quality.txt").write_text("\n".join(lines) + "\n")
+        write_whole(space.folder / "mesh_quality.txt", "\n".join(lines) + "\n")
     return organ.body

@@ -35,7 +35,10 @@ def test_every_entry_says_what_it_means() -> None:
         ({"material": {"youngs": 3.0}}, r"material\.youngs: Extra inputs are not permitted"),
         ({"body": {"unit": "inch"}}, r"body\.unit: .*'m', 'cm' or 'mm', got 'inch'"),
         ({"samples": {"train": 0}}, r"samples\.train: .*greater than or equal to 1, got 0"),
-        ({"loads": {"radius": [0.5, 0.1]}}, r"loads\.radius: expected smallest <= largest"),
+        ({"loads": {"radius": [0.5, 0.1]}}, r"\n  loads\.radius: expected smallest <= largest, got \(0\.5, 0\.1\)$"),
+        ({"samples": {"path": 3}}, r"\n  samples\.path: expected a divisor of samples\.block \(8\), got 3$"),
+        ({"samples": {"seed": "x" * 999}}, r"samples\.seed: .*, got 'x+\.\.\.x+'$"),
+        ({"body": {"source": "a.ply"}, "loads": {"modes": 3001}}, r"\n  loads\.modes: expected at most 3000 with body"),
     ],
 )
 def test_wrong_entries_are_named_with_what_came(entries: dict, message: str) -> None:

@@ -7,20 +7,29 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from softtwin.app import pictures, report
+from softtwin.app import pictures, report, sequences
 from softtwin.app.config import Config
-from softtwin.app.pictures import Studio, camera_side, view_of
-from softtwin.app.report import figure, inner_colours, public_config, report_stage, without_paths
+from softtwin.app.export import Exporter
+from softtwin.app.pictures import Studio, camera_side, inner_colours, view_of
+from softtwin.app.record import Recorder
+from softtwin.app.report import figure, public_config, report_stage, without_paths
+from softtwin.app.sequences import find_registrations
+from softtwin.app.twin import Frame, Twin
 from softtwin.app.workspace import Workspace
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.dataset import LinearResponse, create, write_block
+from softtwin.registration.outcome import Outcome
+from softtwin.registration.pose import Pose
+from softtwin.registration.registrar import Registration
+from softtwin.registration.verdict import Judgement, Verdict
 
 SPLITS = {"train": 4, "validation": 2, "test": 2}
 COMMANDS = {
@@ -29,6 +38,7 @@ COMMANDS = {
     "data": "softtwin generate",
     "surrogate": "softtwin train",
     "registration": "softtwin quickstart",
+    "sequences": "softtwin register",
 }
 
 
@@ -128,9 +138,50 @@ def make_demo(folder: Path, body: Body) -> None:
     forces[-1] = (0.0, 0.3, 0.4)
     for name, part in (("surrogate", 0.9), ("reference", 0.99)):
         np.savez(folder / f"{name}.npz", displacement=part * truth, forces=part * forces, true_forces=forces)
-        row = {"net_force_deviation_N": [0.0, 0.03, 0.04], "seconds": 0.25, "iterations": 7, "reason": "small step"}
+        row: dict[str, Any] = {"net_force_deviation_N": [0.0, 0.03, 0.04], "seconds": 0.25, "iterations": 7}
+        row |= {"outcome": "most_iterations", "verdict": "doubtful", "reasons": [f"the {name} gave up"]}
         (folder / name).mkdir()
         (folder / name / "registration.json").write_text(json.dumps({"frames": [row]}))
+
+
+class Still:
+    """A model without mechanics: what registered frames look like is another test's matter."""
+
+    def __init__(self, body: Body) -> None:
+        self.body = body
+
+
+def make_registration(folder: Path, body: Body, frames: int = 4) -> None:
+    """Frames as `softtwin register` writes them: all good but the second, which is refused, and a cloud without use."""
+    twin = Twin(Still(body), Config.model_validate({"body": {"unit": "mm"}}))  # type: ignore[arg-type]
+    shapes = bends(body, frames)
+    with Recorder(Exporter(twin, folder)) as recorder:
+        for number, shape in enumerate(shapes):
+            refused = number == 1
+            verdict = Judgement(*((Verdict.REFUSED, ("too <far>",)) if refused else (Verdict.ACCEPTED,)))
+            state = SimpleNamespace(displacement=shape)
+            result = Registration(
+                prepared=None,  # type: ignore[arg-type]
+                trial=None,  # type: ignore[arg-type]
+                forces=np.full_like(shape, 0.01),
+                state=state,  # type: ignore[arg-type]
+                pose=Pose.identity(),
+                net_force=np.array([0.0, 0.3, 0.4]),
+                net_force_covariance=1e-4 * np.eye(3),
+                noise=5e-3 if refused else 5e-4,
+                force_scale=0.01,
+                rms_distance=float("nan") if refused else 5e-4,
+                outliers=0.0,
+                informed=3.0,
+                points=100,
+                outcome=Outcome.CONVERGED,
+                judgement=verdict,
+                evaluations=5,
+                seconds=0.1,
+                trace=(),
+            )
+            recorder.add(Frame(number, verdict, result, 0.1, body.points + shape), f"cloud_{number}.ply")
+        recorder.add(Frame(frames, Judgement(Verdict.REFUSED, ("an empty cloud.",)), None, 0.0), "empty.ply")
 
 
 def workspace(root: Path, **entries: Any) -> Workspace:
@@ -153,6 +204,7 @@ def full(tmp_path_factory: pytest.TempPathFactory, body: Body) -> Workspace:
     make_data(space.data, body)
     make_validation(space.folder, body)
     make_demo(space.folder / "demo", body)
+    make_registration(space.folder / "registrations" / "morning", body)
     (space.folder / "stages.json").write_text(json.dumps({"mesh": {"seconds": 5.0}, "generate": {"seconds": 45.0}}))
     return space
 
@@ -171,8 +223,8 @@ def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_full_report_has_a_picture_of_everything(page: Page, full: Workspace) -> None:
     words = page.pictures()
-    organ, modes, samples, charts, registration = 3, 3, 6, 2, 6
-    assert len(words) == organ + modes + samples + charts + registration
+    organ, modes, samples, charts, registration, sequences = 3, 3, 6, 2, 6, 4
+    assert len(words) == organ + modes + samples + charts + registration + sequences
     assert all(words)
     assert "There is no" not in page.text
     assert (full.folder / "report.html").stat().st_size < 6e6
@@ -218,6 +270,41 @@ def test_median_and_worst_sample_are_chosen(full: Workspace) -> None:
     assert [row["error"] for row in rows] == pytest.approx(errors[1:].tolist())
 
 
+def test_the_users_own_registrations_are_shown(page: Page) -> None:
+    text = " ".join(page.text.split())
+    assert "5 frames with the surrogate, forces on all loaded nodes: 3 accepted, 2 refused." in text
+    assert "Worst frame (1): refused, too <far>." in text
+    assert "empty.ply" in text and "an empty cloud." in text
+    assert [words.split(" frame")[0] for words in page.pictures() if " frame (" in words] == ["first", "worst", "last"]
+    assert "surrogate: the surrogate gave up." in text and "most iterations" in text
+
+
+def test_registrations_elsewhere_are_named(full: Workspace, tmp_path: Path, body: Body, no_rendering: None) -> None:
+    make_registration(tmp_path / "evening", body, frames=1)
+    found = find_registrations(full.folder, [tmp_path / "evening", tmp_path / "evening"])
+    assert [folder.name for folder in found] == ["morning", "evening"]
+    page = Page(report_stage(full, [tmp_path / "evening"]))
+    assert "evening" in page.text and "no picture: no driver here" in page.text
+    with pytest.raises(ValueError, match=r"--registrations: expected a folder with registration\.json"):
+        find_registrations(full.folder, [tmp_path])
+
+
+def test_a_registration_that_cannot_be_shown_spoils_nothing_else(full: Workspace, tmp_path: Path, body: Body) -> None:
+    studio = Studio("no pictures")
+    make_registration(tmp_path / "other", beam((3, 2, 2), (0.6, 0.2, 0.2), "tetrahedron"), frames=1)
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "registration.json").write_text('{"frames": []}')
+    made = report._sequences(full, studio, find_registrations(full.folder, [tmp_path / "other", tmp_path / "old"]))
+    assert ["missing" in section for section in made["every"]] == [False, True, True]
+    assert "another body" in made["every"][1]["missing"] and "register again" in made["every"][2]["missing"]
+
+
+def test_a_long_sequence_lists_what_was_not_accepted(body: Body) -> None:
+    rows = [{"frame": i, "verdict": "refused" if i in (50, 60) else "accepted"} for i in range(100)]
+    listed = [row["frame"] for row in sequences._listed(rows)]
+    assert len(listed) == sequences._LISTED and {0, 50, 60, 99} <= set(listed) and listed == sorted(listed)
+
+
 def test_file_needs_nothing_else(page: Page) -> None:
     for tag, attributes in page.elements:
         assert tag not in ("script", "link", "iframe", "object")
@@ -254,6 +341,8 @@ def test_empty_workspace_names_every_command(tmp_path: Path, no_rendering: None)
 def test_each_section_names_its_command(tmp_path: Path) -> None:
     space = workspace(tmp_path)
     for name, command in COMMANDS.items():
+        if name == "sequences":
+            continue  # made from folders, not from the workspace
         section = report._guarded(report._SECTIONS[name], space, Studio("no pictures"))
         if name in ("surrogate", "registration"):
             assert set(section) == {"missing"}
@@ -270,7 +359,7 @@ def test_unfinished_data_set_says_how_far_it_is(tmp_path: Path, body: Body) -> N
 
 def test_without_rendering_the_report_says_so(full: Workspace, no_rendering: None) -> None:
     page = Page(report_stage(full))
-    assert len(page.pictures()) == 2  # the charts do not need it
+    assert len(page.pictures()) == 3  # the charts do not need it
     assert "no picture: no driver here" in page.text
     assert "7 equilibria accepted" in page.text
 

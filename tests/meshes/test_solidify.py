@@ -18,7 +18,7 @@ from softtwin.meshes.solidify import MOST_NODES, Solid, solidify
 
 SIZE = 0.018
 # The thinned surface and its boundary may lie this far from the surface: part of its size, 0.1 m times root 3.
-REACH = 2 * 3e-3 * 0.1 * np.sqrt(3)
+REACH = max(3e-3 * 0.1 * np.sqrt(3), 0.08 * SIZE)
 
 
 def joined(*surfaces: Surface) -> Surface:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import builtins
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
 
 import pytest
 
@@ -58,6 +62,31 @@ def test_text_has_every_check_with_its_advice_and_the_disclaimer_once() -> None:
     assert "0 ok, 1 warnings, 1 missing" in text
     assert text.count("not a medical device") == 1
     assert all(any(line.split()[:2] == [c.status, c.name] for line in text.splitlines()) for c in found)
+
+
+def test_every_package_that_softtwin_needs_has_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    needs = [
+        "zarr>=3.1",
+        "pytetwild>=0.2 ; extra == 'mesh'",
+        'no-such-thing>=1; extra == "app"',
+        "pytest>=8; extra == 'test'",
+    ]
+    monkeypatch.setattr(doctor.metadata, "requires", lambda _: needs)
+    monkeypatch.setattr(doctor, "_LOADED", ())
+    found = {check.name: check for check in doctor.checks()}
+    assert {"python", "zarr", "pytetwild", "no-such-thing", "torch", "disk"} <= found.keys() and "pytest" not in found
+    assert found["no-such-thing"].status == "missing"
+    assert found["no-such-thing"].advice == "pip install 'softtwin[app]'"
+
+
+def test_meshing_has_its_lines() -> None:
+    """What the extra `mesh` of this source tree names is what the doctor looks for once it is installed."""
+    text = (Path(__file__).parents[2] / "pyproject.toml").read_text()
+    extra = tomllib.loads(text)["project"]["optional-dependencies"]["mesh"]
+    named = {re.match(r"[\w-]+", requirement).group(0) for requirement in extra}  # type: ignore[union-attr]
+    installed = {re.match(r"[\w-]+", entry).group(0) for entry in metadata.requires("softtwin") or []}  # type: ignore[union-attr]
+    assert named & installed <= {check.name for check in doctor.checks()}
+    assert "gmsh" in named & installed
 
 
 def test_what_cannot_be_imported_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,6 +31,11 @@ def _names(requirements: list[str]) -> set[str]:
     return {_canonical(re.match(r"[A-Za-z0-9._-]+", text).group(0)) for text in requirements}  # type: ignore[union-attr]
 
 
+def test_torch_is_new_enough_for_fused_steps_on_the_cpu() -> None:
+    (floor,) = (text for text in PROJECT["optional-dependencies"]["torch"] if text.startswith("torch"))
+    assert tuple(map(int, floor.removeprefix("torch>=").split("."))) >= (2, 4)
+
+
 def test_every_dependency_is_pinned_for_ci() -> None:
     extras = PROJECT["optional-dependencies"]
     wanted = _names(PROJECT["dependencies"]).union(*(_names(extras[name]) for name in extras if name != "fenicsx"))
@@ -62,7 +67,8 @@ def test_a_package_file_holds_a_docstring_only(folder: str) -> None:
 def test_all_folders_are_packaged_and_watched() -> None:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
     names = {f"softtwin.{folder}" for folder in FOLDERS}
-    assert set(settings["setuptools"]["packages"]) == names
+    inside = (path.parent.relative_to(ROOT) for name in FOLDERS for path in (ROOT / name).rglob("__init__.py"))
+    assert set(settings["setuptools"]["packages"]) == {f"softtwin.{'.'.join(path.parts)}" for path in inside} >= names
     assert set(settings["importlinter"]["root_packages"]) == names
     assert set(settings["mypy"]["packages"]) == names
 

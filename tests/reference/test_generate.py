@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,7 @@ from softtwin.meshes.shapes import beam
 from softtwin.reference import dataset
 from softtwin.reference.dataset import SPLITS, DataSet, DataSetError, drop_block
 from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.generate import Plan, generate, linear_response, probe_cotangent, solve_block
+from softtwin.reference.generate import DamagedBlock, Plan, generate, linear_response, probe_cotangent, solve_block
 from softtwin.reference.loads import LoadPlan
 
 PLAN = Plan(
@@ -125,8 +127,7 @@ def test_kill_9_loses_only_what_was_under_way(
     kills = 0
     for delay in (0.0, 0.05, 0.1, 0.15):  # after the first block: a kill falls into different moments of the work
         process = start(path, ranks, mpi_environment)
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline and process.poll() is None and not _blocks(path):
+        while process.poll() is None and not _blocks(path):
             time.sleep(0.005)
         time.sleep(delay)
         if process.poll() is None:
@@ -160,10 +161,90 @@ def test_ctrl_c_leaves_whole_blocks(undisturbed: DataSet, tmp_path: Path, mpi_en
 
 def test_another_plan_or_body_is_refused_by_name(undisturbed: DataSet) -> None:
     other = Plan(loads=PLAN.loads, samples=PLAN.samples, block=3, seed=6)
-    with pytest.raises(DataSetError, match=r"another plan \(differs in \['seed'\]\)"):
+    with pytest.raises(DataSetError, match=r"differs in seed \(5 there, 6 here\)\); choose another folder"):
         generate(undisturbed.path, body(), other)
-    with pytest.raises(DataSetError, match="data set of another body"):
+    with pytest.raises(DataSetError, match=r"differs in the body \(63 nodes, fingerprint \w{12} there, 54 nodes"):
         generate(undisturbed.path, beam((5, 2, 2), (0.6, 0.2, 0.2)), PLAN)
+
+
+def test_another_zone_on_the_same_nodes_is_another_body(tmp_path: Path) -> None:
+    zoned = replace(PLAN, loads=replace(PLAN.loads, zones=("tip",)), samples={"train": 1, "validation": 1, "test": 1})
+    generate(tmp_path / "data.zarr", body(), zoned)
+    other = body().with_sets(tip=body().node_sets["tip"][1:])
+    with pytest.raises(DataSetError, match="differs in the zone 'tip'"):
+        generate(tmp_path / "data.zarr", other, zoned)
+
+
+def test_a_data_set_that_was_thrown_away_is_made_anew_in_the_same_process(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    generate(path, body(), replace(PLAN, young_modulus=9000.0))
+    assert_same(undisturbed, generate(path, body(), PLAN, again=True))
+
+
+def test_options_that_came_later_had_their_defaults_before(undisturbed: DataSet, tmp_path: Path) -> None:
+    import zarr
+
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    attributes = zarr.open_group(str(path), mode="r+").attrs
+    header = json.loads(attributes["header"])
+    del header["plan"]["newton"]["max_load_steps"], header["checksums"]
+    attributes["header"] = json.dumps(header)
+    assert_same(undisturbed, generate(path, body(), PLAN))
+    with pytest.raises(DataSetError, match=r"newton\.max_load_steps"):
+        generate(path, body(), replace(PLAN, newton=NewtonOptions(max_load_steps=3)))
+
+
+def test_two_do_not_write_one_data_set(undisturbed: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lock is the system's: it goes with the process that holds it, even where that is killed."""
+    from softtwin.reference import generate as farm
+
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    monkeypatch.setattr(farm, "_PATIENCE_S", 0.1)
+    program = (
+        "import pathlib, sys, time; from softtwin.reference.generate import _locked\n"
+        "with _locked(pathlib.Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
+    )
+    holder = subprocess.Popen([sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+        with pytest.raises(DataSetError, match=r"another `generate` is at work in .*data\.zarr"):
+            generate(path, body(), PLAN)
+    finally:
+        holder.kill()
+        holder.communicate()
+    assert_same(undisturbed, generate(path, body(), PLAN))
+
+
+FAILING = """
+import sys
+from softtwin.meshes.shapes import beam
+from softtwin.reference import generate as farm
+from softtwin.reference.fenicsx import MPI
+from softtwin.reference.ranks import FailedElsewhere
+rank = MPI.COMM_WORLD.rank
+def full(*_):
+    raise OSError(28, "No space left on device")
+if rank == int(sys.argv[2]):
+    farm.write_block = full
+plan = farm.Plan(loads=farm.LoadPlan(modes=6, displacement=0.08), block=1, seed=5,
+                 samples={"train": 4, "validation": 1, "test": 1})
+try:
+    farm.generate(sys.argv[1], beam((6, 2, 2), (0.6, 0.2, 0.2), "hexahedron"), plan)
+except (OSError, FailedElsewhere) as error:
+    print(rank, type(error).__name__, flush=True)
+    MPI.COMM_WORLD.Barrier()  # everyone comes here
+"""
+
+
+@pytest.mark.mpi
+@pytest.mark.skipif(shutil.which("mpirun") is None, reason="mpirun is absent")
+@pytest.mark.parametrize("failing", [0, 1])
+def test_a_rank_that_fails_at_work_ends_all(tmp_path: Path, mpi_environment: dict[str, str], failing: int) -> None:
+    command = ["mpirun", "-n", "2", sys.executable, "-c", FAILING, str(tmp_path / "data.zarr"), str(failing)]
+    told = subprocess.run(command, env=mpi_environment, capture_output=True, text=True, timeout=120, check=False)
+    assert sorted(told.stdout.splitlines()) == ["0 OSError", "1 FailedElsewhere"], told.stderr
 
 
 def test_a_truncated_block_is_found_and_made_again(undisturbed: DataSet, tmp_path: Path) -> None:
@@ -173,6 +254,8 @@ def test_a_truncated_block_is_found_and_made_again(undisturbed: DataSet, tmp_pat
     chunk.write_bytes(chunk.read_bytes()[: chunk.stat().st_size // 2])
     with pytest.raises(DataSetError, match=r"block 1 .*(damaged|checksum)"):
         DataSet(path).samples("train")
+    with pytest.warns(DamagedBlock, match=r"block 1 in .* is damaged .*made again"):
+        assert_same(undisturbed, generate(path, body(), PLAN))
     drop_block(path, 1)
     with pytest.raises(DataSetError, match=r"block 1 of \d+ .* never finished.*softtwin generate"):
         DataSet(path).samples("train")
@@ -187,13 +270,66 @@ def test_a_changed_number_does_not_pass_the_checksum(undisturbed: DataSet, tmp_p
     shutil.copytree(undisturbed.path, path)
     forces = zarr.open_group(str(path), mode="r+")["samples/forces"]
     forces[4, 0, 0] = float(forces[4, 0, 0]) + 1e-9
-    with pytest.raises(DataSetError, match=r"block 1 .* does not match its checksum"):
+    with pytest.raises(DataSetError, match=r"block 1 .* does not match its checksum.*makes damaged blocks again"):
         DataSet(path).samples("train")
+    with pytest.warns(DamagedBlock, match=r"block 1 in .* does not match its checksum"):
+        assert_same(undisturbed, generate(path, body(), PLAN))
+
+
+def test_a_damaged_checksum_costs_its_block(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    (path / "samples" / "checksum" / "c" / "2").write_bytes(b"no")
+    assert DataSet(path).missing_blocks() == [2]
+    assert_same(undisturbed, generate(path, body(), PLAN))
+
+
+@pytest.mark.parametrize("name", ["response/left", "modes/shapes", "body/points"])
+def test_damage_outside_the_blocks_is_named(undisturbed: DataSet, tmp_path: Path, name: str) -> None:
+    import zarr
+
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    array = zarr.open_group(str(path), mode="r+")[name]
+    array[0] = np.asarray(array[0]) + 1e-9
+    with pytest.raises(DataSetError, match=f"{name.split('/')[0]}.*truncated or changed.*--again"):
+        generate(path, body(), PLAN)
+
+
+def test_only_blocks_that_are_there_can_be_made_again(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    for wrong in (999, -1):
+        with pytest.raises(DataSetError, match=rf"blocks in 0\.\.5, got \[{wrong}\]"):
+            generate(path, body(), PLAN, redo=(0, wrong))
+        with pytest.raises(DataSetError, match=rf"a number in 0\.\.5, got {wrong}"):
+            drop_block(path, wrong)
+    assert DataSet(path).missing_blocks() == []
+    assert_same(undisturbed, generate(path, body(), PLAN, redo=(0,)))
+    with pytest.raises(DataSetError, match=r"expected a data set with blocks \[0\]"):
+        generate(tmp_path / "nothing.zarr", body(), PLAN, redo=(0,))
+
+
+def test_the_identity_is_that_of_the_samples(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    assert DataSet(path).identity == undisturbed.identity
+    drop_block(path, 0)
+    assert DataSet(path).identity != undisturbed.identity
 
 
 def test_a_header_that_was_never_written_is_no_data_set(tmp_path: Path) -> None:
     with pytest.raises(DataSetError, match=r"expected a Zarr 3 data set .*`softtwin generate`"):
         DataSet(tmp_path / "nothing.zarr")
+
+
+def test_a_lost_header_does_not_cost_what_was_solved(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    (path / "zarr.json").write_text("{")
+    with pytest.raises(DataSetError, match="cannot be read"):
+        generate(path, body(), PLAN)
+    assert len(list((path / "samples" / "checksum" / "c").iterdir())) == undisturbed.block_count
 
 
 def test_a_full_disk_keeps_what_was_whole(undisturbed: DataSet, tmp_path: Path, monkeypatch) -> None:
@@ -266,6 +402,33 @@ def test_the_linear_response_of_low_rank_is_close_to_the_whole(monkeypatch) -> N
 def test_plans_that_cannot_be_are_refused(entries: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Plan(**entries)
+
+
+@pytest.mark.parametrize(
+    ("sets", "loads", "message"),
+    [
+        ({"fixed": body().boundary_nodes}, {}, r"Body\.fixed: expected free nodes on the boundary, got all \d+"),
+        ({"held": body().fixed}, {"zones": ("held",)}, r"none of the 9 nodes of \('held',\) is on the free boundary"),
+        ({"held": body().fixed}, {"zones": ("tip", "held")}, r"none of the 9 nodes of \('held',\)"),
+        ({}, {"zones": ("liver",)}, r"LoadPlan\.zones: expected names among"),
+        ({}, {"modes": 81}, r"LoadPlan\.modes: expected 1\.\.80 for 54 free nodes, got 81"),
+        (
+            {},
+            {"displacement": 50.0},
+            r"LoadPlan\.displacement: expected at most the size of the body, 0\.663 m, got 50",
+        ),
+    ],
+)
+def test_loads_that_a_body_cannot_carry_are_refused(sets: dict, loads: dict, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        generate(tmp_path / "data.zarr", body().with_sets(**sets), replace(PLAN, loads=replace(PLAN.loads, **loads)))
+    assert not (tmp_path / "data.zarr").exists()
+
+
+def test_pilots_that_find_no_equilibrium_are_said(tmp_path: Path) -> None:
+    hopeless = replace(PLAN, newton=NewtonOptions(max_iterations=1, max_load_steps=1))
+    with pytest.raises(RuntimeError, match="most pilot loads found no equilibrium"):
+        generate(tmp_path / "data.zarr", body(), hopeless)
 
 
 def test_solving_a_block_again_changes_nothing(undisturbed: DataSet, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ import pytest
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 torch = pytest.importorskip("torch", reason="torch is absent")
 
+import ufl
+
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.equilibrium import NewtonOptions, Problem
 from softtwin.reference.layer import EquilibriumLayer
-from softtwin.reference.materials import NeoHookean
+from softtwin.reference.materials import Energy, NeoHookean
 
 E, NU = 5.0, 0.3  # soft and small: displacements, forces and moduli of like size suit differences
 EXACT = NewtonOptions(tolerance=1e-12)
@@ -59,6 +62,22 @@ def test_parameters_of_each_cell_have_gradients(body: Body) -> None:
         forces = forces_of(body, torch.full((4, 3), 0.05, dtype=torch.float64))
         young = torch.tensor([4.0, 6.0], dtype=torch.float64, requires_grad=True)
         assert torch.autograd.gradcheck(lambda y: layer(forces, y), (young,), eps=1e-5, atol=1e-6)
+
+
+def test_an_energy_of_ones_own_has_gradients(body: Body) -> None:
+    def neo_hookean(F: Any, mu: Any, lmbda: Any) -> Any:
+        ln_J = ufl.ln(ufl.det(F))
+        return mu / 2 * (ufl.inner(F, F) - 3) - mu * ln_J + lmbda / 2 * ln_J**2
+
+    with Problem(body, Energy(neo_hookean, {"mu": 2.0, "lmbda": np.full(len(body.cells), 3.0)}), EXACT) as problem:
+        layer = EquilibriumLayer(problem)
+        forces = forces_of(body, torch.full((4, 3), 0.05, dtype=torch.float64))
+        mu = torch.tensor(1.9, dtype=torch.float64, requires_grad=True)
+        lmbda = torch.tensor([2.5, 3.5], dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(
+            lambda m, k: layer(forces, lmbda=k, mu=m), (mu, lmbda), eps=1e-5, atol=1e-6, rtol=1e-5
+        )
+        assert problem.material.parameters["mu"] == pytest.approx(1.9, abs=1e-4)
 
 
 def test_a_batch_is_its_samples_and_types_are_kept(layer: EquilibriumLayer, body: Body) -> None:

@@ -221,6 +221,23 @@ def test_parameters_change_without_a_new_problem(box: Body) -> None:
             problem.set_material(SaintVenantKirchhoff(E, NU))
 
 
+def test_another_function_is_another_law(box: Body) -> None:
+    """Its forms were compiled from the first one and would have stayed."""
+
+    def soft(F, mu):
+        return mu / 2 * (ufl.inner(F, F) - 3 - 2 * ufl.ln(ufl.det(F)))
+
+    def hard(F, mu):
+        return 10 * soft(F, mu)
+
+    with Problem(box, Energy(soft, {"mu": 1000.0})) as problem:
+        with pytest.raises(ValueError, match="expected another Energy of the same function and parameters"):
+            problem.set_material(Energy(hard, {"mu": 1000.0}))
+        first = problem.solve(tip_force(box)).energy
+        problem.set_material(Energy(soft, {"mu": 2000.0}))
+        assert abs(problem.solve(tip_force(box)).energy) < 0.7 * abs(first)
+
+
 # ---------------------------------------------------------------------- Newton and linear algebra
 
 
@@ -427,6 +444,58 @@ def test_a_start_that_is_inside_out_goes_to_load_steps() -> None:
     turned = np.column_stack([-np.ones(len(arm)), arm @ np.array([[c, s], [-s, c]]) - arm])
     with Problem(body, NeoHookean(1.0, 0.3), held={"fixed": "xyz", "tip": "xyz"}) as problem:
         assert problem.solve(Loading(displacement={"tip": turned})).load_steps > 1
+
+
+TURNED = {
+    "tetra": beam((6, 2, 2), (0.6, 0.2, 0.2), "tetrahedron"),
+    "hexahedron": beam((6, 2, 2), (0.6, 0.2, 0.2), "hexahedron"),
+    "tetra10": beam((3, 1, 1), (0.6, 0.2, 0.2), "tetrahedron").quadratic(),
+    "hexahedron27": beam((3, 1, 1), (0.6, 0.2, 0.2), "hexahedron").quadratic(),
+}
+LAWS: dict[str, Material] = {
+    "Saint-Venant-Kirchhoff": SaintVenantKirchhoff(E, NU),
+    "Neo-Hookean": NeoHookean(E, NU),
+    "isochoric Neo-Hookean": IsochoricNeoHookean(E, NU),
+    "Mooney-Rivlin": MooneyRivlin.from_elastic(E, NU),
+    "own": Energy(lambda F, mu: mu * ufl.inner(F, F) ** 2, {"mu": 1000.0}),
+    "incompressible Neo-Hookean": IncompressibleNeoHookean(1000.0),
+    "incompressible Mooney-Rivlin": IncompressibleMooneyRivlin(500.0, 500.0),
+}
+
+
+@pytest.mark.parametrize("kind", TURNED)
+@pytest.mark.parametrize("law", LAWS)
+def test_nothing_inside_out_has_an_energy(law: str, kind: str) -> None:
+    """Whole, in one cell, mirrored, by a hair, flat: for each law and element, whatever a compiler makes of NaN."""
+    body, material = TURNED[kind], LAWS[law]
+    if material.is_mixed and body.kind.degree == 1:
+        body = body.quadratic()
+    pushed = np.zeros_like(body.points)
+    corner = body.cells[0, 0]
+    across = body.points[body.cells[0]].mean(axis=0) - body.points[corner]
+    pushed[corner] = 12.0 * across  # one corner right through its cell
+    flat, by_a_hair, mirrored = (
+        np.column_stack([-share * body.points[:, 0], *np.zeros((2, len(pushed)))]) for share in (1.0, 1.0 + 1e-9, 2.0)
+    )
+    with Problem(body, material) as problem:
+        assert np.isfinite(problem.energy(0.5 * mirrored * 0.9))
+        for field in (flat, by_a_hair, mirrored, 50.0 * mirrored, pushed):
+            assert not np.isfinite(problem.energy(field))
+
+
+def test_forms_leave_small_numbers_as_they_are(box: Body) -> None:
+    """Code that is linked with -ffast-math makes the whole process round the smallest numbers to zero."""
+    with Problem(box, NeoHookean(E, NU)) as problem:
+        problem.energy(np.zeros_like(box.points))
+    assert np.float64(5e-324) * np.float64(1.0) > 0.0
+
+
+def test_a_singular_tangent_ends_a_search_and_no_more(box: Body) -> None:
+    """Load steps that blow up: neither band nor MUMPS can factor what is infinite, and that is no convergence."""
+    with Problem(box, NeoHookean(E, 0.3)) as problem:
+        with pytest.raises(NotConverged), np.errstate(over="ignore", invalid="ignore"):
+            problem.solve(Loading(pressure={"boundary": -2000.0}))
+        assert problem.solve(tip_force(box)).is_stable
 
 
 def test_rounding_ends_a_linear_problem_that_is_nearly_incompressible() -> None:

@@ -147,7 +147,6 @@ def perceptron(data: DataSet) -> Surrogate:
 @pytest.fixture(params=["reduced", "perceptron"])
 def surrogate(request: pytest.FixtureRequest) -> Surrogate:
     model: Surrogate = request.getfixturevalue(request.param)
-    model.reset()
     return model
 
 

@@ -14,7 +14,7 @@ from softtwin.surrogate.predictor import Surrogate
 def _predictions(surrogate: Surrogate, data: DataSet) -> np.ndarray:
     forces = np.zeros((len(data.samples("test")), *data.body.points.shape))
     forces[:, data.response.loaded] = data.samples("test").forces
-    return np.stack([surrogate.solve(load) for load in forces])
+    return np.stack([surrogate.solve(load).displacement for load in forces])
 
 
 def test_errors_follow_their_definitions(surrogate: Surrogate, data: DataSet) -> None:

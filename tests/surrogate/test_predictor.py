@@ -1,4 +1,4 @@
-"""The surrogate as a forward model: derivatives, the restricted fast path, saving and loading."""
+"""The surrogate as a forward model: states with derivatives, the reduced fast path, saving and loading."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.dataset import DataSet
+from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.predictor import CARD, WEIGHTS, Surrogate, TwinError, load, save
 
 STEPS = 0.5 ** np.arange(3, 8)
@@ -28,21 +30,22 @@ def _rates(remainders: list[float]) -> np.ndarray:
     return np.log2(np.array(remainders[:-1]) / np.array(remainders[1:]))
 
 
-def test_sensitivity_is_the_derivative(reduced: Surrogate, forces: np.ndarray) -> None:
+def test_push_is_the_derivative(reduced: Surrogate, forces: np.ndarray) -> None:
     direction = _direction(reduced, 0, np.abs(forces).max())
     start = reduced.solve(forces)
-    slope = reduced.sensitivity(direction.reshape(-1, 1)).reshape(-1, 3)
-    remainders = [np.linalg.norm(reduced.solve(forces + h * direction) - start - h * slope) for h in STEPS]
+    slope = start.push(direction.reshape(-1, 1)).reshape(-1, 3)
+    moved = [reduced.solve(forces + h * direction).displacement for h in STEPS]
+    remainders = [np.linalg.norm(u - start.displacement - h * slope) for h, u in zip(STEPS, moved, strict=True)]
     assert _rates(remainders)[-1] == pytest.approx(2.0, abs=0.1)
 
 
-def test_pullback_is_the_gradient(reduced: Surrogate, forces: np.ndarray) -> None:
+def test_pull_is_the_gradient(reduced: Surrogate, forces: np.ndarray) -> None:
     """Of the squared misfit, whose gradient with respect to the displacement is the displacement."""
     direction = _direction(reduced, 1, np.abs(forces).max())
     start = reduced.solve(forces)
-    slope = float(np.vdot(reduced.pullback(start), direction))
-    value = 0.5 * float(np.vdot(start, start))
-    moved = [reduced.solve(forces + h * direction) for h in STEPS]
+    slope = float(np.vdot(start.pull(start.displacement), direction))
+    value = 0.5 * float(np.vdot(start.displacement, start.displacement))
+    moved = [reduced.solve(forces + h * direction).displacement for h in STEPS]
     remainders = [abs(0.5 * float(np.vdot(u, u)) - value - h * slope) for h, u in zip(STEPS, moved, strict=True)]
     assert _rates(remainders)[-1] == pytest.approx(2.0, abs=0.1)
 
@@ -50,52 +53,64 @@ def test_pullback_is_the_gradient(reduced: Surrogate, forces: np.ndarray) -> Non
 def test_perceptron_is_linear_between_its_kinks(perceptron: Surrogate, forces: np.ndarray) -> None:
     direction = _direction(perceptron, 2, 1e-7 * np.abs(forces).max())
     start = perceptron.solve(forces)
-    slope = perceptron.sensitivity(direction.reshape(-1, 1)).reshape(-1, 3)
-    change = perceptron.solve(forces + direction) - start
+    slope = start.push(direction.reshape(-1, 1)).reshape(-1, 3)
+    change = perceptron.solve(forces + direction).displacement - start.displacement
     # what cancels in the difference: round-off of values seven decades above it
     assert np.linalg.norm(change - slope) < 1e-6 * np.linalg.norm(change)
 
 
-def test_pullback_and_sensitivity_are_adjoint(surrogate: Surrogate, forces: np.ndarray) -> None:
-    surrogate.solve(forces)
+def test_push_and_pull_are_adjoint(surrogate: Surrogate, forces: np.ndarray) -> None:
+    state = surrogate.solve(forces)
     columns = np.stack([_direction(surrogate, seed, 1.0).ravel() for seed in range(3)], axis=1)
     cotangent = np.random.default_rng(9).standard_normal(surrogate.body.points.shape)
-    forward = cotangent.ravel() @ surrogate.sensitivity(columns)
-    backward = surrogate.pullback(cotangent).ravel() @ columns
+    forward = cotangent.ravel() @ state.push(columns)
+    backward = state.pull(cotangent).ravel() @ columns
     assert np.abs(forward).min() > 0.0
     assert np.abs(forward - backward).max() < 1e-11 * np.abs(forward).max()
 
 
 def test_many_columns_at_once_equal_few(surrogate: Surrogate, forces: np.ndarray) -> None:
     """More columns than the network has coordinates take another way."""
-    surrogate.solve(forces)
+    state = surrogate.solve(forces)
     columns = np.stack([_direction(surrogate, seed, 1.0).ravel() for seed in range(200)], axis=1)
-    together = surrogate.sensitivity(columns)
-    apart = np.concatenate([surrogate.sensitivity(columns[:, i : i + 1]) for i in range(200)], axis=1)
+    together = state.push(columns)
+    apart = np.concatenate([state.push(columns[:, i : i + 1]) for i in range(200)], axis=1)
     assert np.abs(together - apart).max() < 1e-11 * np.abs(apart).max()
 
 
-def test_derivatives_are_those_of_the_last_state(reduced: Surrogate, forces: np.ndarray) -> None:
-    reduced.solve(forces)
-    loaded = reduced.pullback(forces)
-    reduced.reset()
-    assert np.abs(reduced.pullback(forces) - loaded).max() > 1e-3 * np.abs(loaded).max()
+def test_a_state_stays_what_it_was(reduced: Surrogate, forces: np.ndarray) -> None:
+    state = reduced.solve(forces)
+    before, pulled = state.displacement.copy(), state.pull(forces)
+    other = reduced.solve(-2.0 * forces)
+    assert np.array_equal(state.displacement, before) and np.array_equal(state.pull(forces), pulled)
+    assert np.abs(other.pull(forces) - pulled).max() > 1e-3 * np.abs(pulled).max()
 
 
-def test_restricted_agrees_with_the_whole(surrogate: Surrogate, forces: np.ndarray) -> None:
+def test_the_reduced_surrogate_agrees_with_the_whole(surrogate: Surrogate, forces: np.ndarray) -> None:
     basis = np.stack([_direction(surrogate, seed, np.abs(forces).max()).ravel() for seed in range(4)], axis=1)
-    rows = np.array([40, 3, 17])
+    nodes = np.array([40, 3, 17])
     c = np.array([0.3, -0.2, 0.5, 0.1])
-    restricted = surrogate.restricted(rows, basis)
+    few = surrogate.reduced(nodes, basis).solve(c)
     whole = surrogate.solve((basis @ c).reshape(-1, 3))
-    jacobian = surrogate.sensitivity(basis).reshape(-1, 3, 4)[rows].reshape(-1, 4)
-    tolerance = 1e-11 * np.abs(whole).max()
-    assert np.abs(restricted.solve_coefficients(c) - whole[rows]).max() < tolerance
-    assert np.abs(restricted.full(c) - whole).max() < tolerance
-    assert np.abs(restricted.jacobian(c) - jacobian).max() < 1e-11 * np.abs(jacobian).max()
-    cotangent = np.random.default_rng(3).standard_normal((3, 3))
-    gradient = restricted.gradient(c, cotangent)
-    assert np.abs(gradient - cotangent.ravel() @ jacobian).max() < 1e-11 * np.abs(gradient).max()
+    pushed = whole.push(basis).reshape(-1, 3, 4)[nodes].reshape(-1, 4)
+    tolerance = 1e-11 * np.abs(whole.displacement).max()
+    assert np.abs(few.positions - whole.displacement[nodes]).max() < tolerance
+    assert np.abs(few.full.displacement - whole.displacement).max() < tolerance
+    rows = csr_array(np.random.default_rng(3).standard_normal((5, 9)))
+    assert np.abs(few.jacobian(rows) - rows @ pushed).max() < 1e-11 * np.abs(rows @ pushed).max()
+    assert np.abs(few.moved(c).ravel() - pushed @ c).max() < 1e-11 * np.abs(pushed @ c).max()
+
+
+def test_extent_is_one_at_the_farthest_load_of_the_training(reduced: Surrogate, data: DataSet) -> None:
+    assert reduced.solve(np.zeros_like(reduced.body.points)).extent is None
+    known = with_domain(reduced, data)
+    extents = []
+    for loads in data.samples("train").forces:
+        forces = np.zeros_like(known.body.points)
+        forces[data.response.loaded] = loads
+        extents.append(known.solve(forces).extent)
+    assert max(extents) == pytest.approx(1.0, abs=0.2) and min(extents) < 0.9
+    assert known.solve(3.0 * forces).extent > 2.0 * known.solve(forces).extent
 
 
 def test_forces_where_none_were_trained_are_refused_by_name(surrogate: Surrogate) -> None:
@@ -104,8 +119,8 @@ def test_forces_where_none_were_trained_are_refused_by_name(surrogate: Surrogate
     bad[inside, 1] = 1e-9
     with pytest.raises(ValueError, match=rf"1 other nodes, first \[{inside}\]"):
         surrogate.solve(bad)
-    with pytest.raises(ValueError, match=rf"columns.*first \[{inside}\]"):
-        surrogate.sensitivity(bad.reshape(-1, 1))
+    with pytest.raises(ValueError, match=rf"basis.*first \[{inside}\]"):
+        surrogate.reduced([0], bad.reshape(-1, 1))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -118,12 +133,12 @@ def test_wrong_shapes_are_refused(surrogate: Surrogate) -> None:
     count = surrogate.body.points.size
     with pytest.raises(ValueError, match=r"forces: expected shape \(45, 3\), got \(3,\)"):
         surrogate.solve(np.zeros(3))
-    with pytest.raises(ValueError, match=rf"columns: expected shape \({count}, k\)"):
-        surrogate.sensitivity(np.zeros((4, 2)))
-    with pytest.raises(ValueError, match=r"rows: expected 0\.\.44, got 0\.\.45"):
-        surrogate.restricted([0, 45], np.zeros((count, 2)))
+    with pytest.raises(ValueError, match=rf"changes: expected shape \({count}, k\)"):
+        surrogate.solve(np.zeros_like(surrogate.body.points)).push(np.zeros((4, 2)))
+    with pytest.raises(ValueError, match=r"nodes: expected 0\.\.44, got 0\.\.45"):
+        surrogate.reduced([0, 45], np.zeros((count, 2)))
     with pytest.raises(ValueError, match=r"coefficients: expected shape \(2,\), got \(3,\)"):
-        surrogate.restricted([0], np.zeros((count, 2))).solve_coefficients(np.zeros(3))
+        surrogate.reduced([0], np.zeros((count, 2))).solve(np.zeros(3))
 
 
 # ------------------------------------------------------------------ on disk
@@ -134,8 +149,9 @@ def test_a_loaded_surrogate_is_the_saved_one_bit_by_bit(
 ) -> None:
     save(surrogate, tmp_path / "twin")
     again = load(tmp_path / "twin", surrogate.body)
-    assert np.array_equal(again.solve(forces), surrogate.solve(forces))
-    assert np.array_equal(again.pullback(forces), surrogate.pullback(forces))
+    before, after = surrogate.solve(forces), again.solve(forces)
+    assert np.array_equal(after.displacement, before.displacement)
+    assert np.array_equal(after.pull(forces), before.pull(forces))
     assert again.card["architecture"] == surrogate.card["architecture"]
     assert {path.name for path in (tmp_path / "twin").iterdir()} == {WEIGHTS, CARD}
 

@@ -1,0 +1,189 @@
+"""The record of a registered sequence: figures of every frame in one JSON file that is whole whenever it is there."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softtwin.meshes.metrics import target_errors
+from softtwin.registration.registrar import Registration
+from softtwin.registration.verdict import Verdict
+
+from .export import SERIES, Exporter
+from .twin import Frame, Twin
+
+Floats = NDArray[np.float64]
+NOTICE = "Research software: not a medical device."
+RECORD = "registration.json"
+_EVERY, _SHARE = 1.0, 0.05  # at least so many seconds between two writings, and at most this share of the time on them
+
+
+class Recorder:
+    """Writes the frames of a sequence as they come; a record of an earlier sequence and its files are removed first.
+
+    Use it in a `with` statement: at its end, Ctrl-C included, the record holds every frame that was added.
+
+    Args:
+        exporter: twin, folder and formats of the files of each frame.
+        zone: that may carry force, for the record.
+        truth: true node positions of each frame, (frames, n, 3), metres, to state errors.
+    """
+
+    def __init__(self, exporter: Exporter, zone: str | None = None, truth: Floats | None = None) -> None:
+        self.exporter, self.truth = exporter, truth
+        self.rows: list[dict[str, Any]] = []
+        self.header = _header(exporter.twin, zone)
+        self._due = -math.inf
+        exporter.folder.mkdir(parents=True, exist_ok=True)
+        remove_record(exporter.folder)
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.write()
+
+    def add(self, frame: Frame, cloud: str = "") -> dict[str, Any]:
+        """Write a frame's files and enter its figures, which are returned.
+
+        Args:
+            frame: the frame.
+            cloud: name of the cloud's file.
+        """
+        row: dict[str, Any] = {"frame": frame.number, "cloud": cloud, "verdict": frame.judgement.verdict.value}
+        row |= {"reasons": list(frame.judgement.reasons), "seconds": frame.seconds, "files": []}
+        if frame.registration is not None:
+            truth = None if self.truth is None else self.truth[frame.number]
+            row |= frame_figures(self.exporter.twin, frame.registration, truth)
+            row["files"] = self.exporter.write(frame.number, frame.registration, frame.cloud)
+        self.rows.append(row)
+        if time.monotonic() > self._due:
+            self.write()
+        return row
+
+    def write(self) -> None:
+        """Write the record, and the time series of the frames not refused, each whole or not at all."""
+        begin = time.monotonic()
+        usable = (row for row in self.rows if row["verdict"] != Verdict.REFUSED.value)
+        series = self.exporter.write_series((row["frame"], row["files"]) for row in usable)
+        content = {**self.header, "counts": counts(self.rows), "series": series, "frames": self.rows}
+        path = self.exporter.folder / RECORD
+        partial = path.with_name(f".{RECORD}.partial")
+        partial.write_text(json.dumps(finite(content), indent=1, allow_nan=False) + "\n")
+        os.replace(partial, path)
+        now = time.monotonic()
+        self._due = now + max(_EVERY, (now - begin) / _SHARE)
+
+
+def _header(twin: Twin, zone: str | None) -> dict[str, Any]:
+    place, section = twin.coordinates, twin.config.registration
+    options = section.model_dump() | ({} if zone is None else {"zone": zone})
+    return {
+        "notice": NOTICE,
+        "format": 2,
+        "body": twin.body.fingerprint,
+        "files_in": {"unit": place.unit, "axes": place.axes},
+        "options": options,
+    }
+
+
+def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dict[str, Any]:
+    """What is known of a registered frame: SI units, on the axes of the twin's files.
+
+    Args:
+        twin: the twin.
+        result: what was found.
+        truth: true node positions, (n, 3), metres, on the inner axes; None where they are not known.
+    """
+    place = twin.coordinates
+    turned = place.directions(np.eye(3))
+    row: dict[str, Any] = {
+        "outcome": result.outcome.name.lower(),
+        "rms_distance_m": result.rms_distance,
+        "noise_m": result.noise,
+        "net_force_N": place.directions(result.net_force).tolist(),
+        "net_force_deviation_N": result.net_force_deviation.tolist(),
+        "net_force_covariance_N2": (turned @ result.net_force_covariance @ turned).tolist(),
+        "force_scale_N": result.force_scale,
+        "largest_displacement_m": float(np.linalg.norm(result.displacement, axis=1).max()),
+        "pose": place.motion(result.pose.matrix).tolist(),
+        "points": result.points,
+        "outliers": result.outliers,
+        "informed": result.informed,
+        "iterations": len(result.trace),
+        "evaluations": result.evaluations,
+        "solve_seconds": result.seconds,
+    }
+    moved = {name: points.displace(result.displacement) for name, points in twin.embeddings.items()}
+    row["targets"] = {name: {"movement_m": _mean_length(vectors)} for name, vectors in moved.items()}
+    if truth is not None:
+        rest = twin.body.points
+        row["error"] = asdict(target_errors(rest + result.displacement, truth))
+        for name, points in twin.embeddings.items():
+            row["targets"][name]["error_m"] = _mean_length(moved[name] - points.displace(truth - rest))
+    return row
+
+
+def _mean_length(vectors: Floats) -> float:
+    return float(np.linalg.norm(vectors, axis=1).mean())
+
+
+def counts(rows: list[dict[str, Any]]) -> dict[str, int]:
+    """How many frames bear each verdict."""
+    return {verdict.value: sum(row["verdict"] == verdict.value for row in rows) for verdict in Verdict}
+
+
+def finite(value: Any) -> Any:
+    """The value with `null` in place of numbers that JSON has no word for."""
+    if isinstance(value, Mapping):
+        return {key: finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def describe(row: Mapping[str, Any]) -> str:
+    """One line for a person: the verdict with its first reason, distance, net force with its doubt, errors if known."""
+    line = f"frame {row['frame']:3d}: {row['verdict']}"
+    if row["reasons"]:
+        line += f" ({row['reasons'][0]})"
+    if "net_force_N" not in row:
+        return line
+    force, doubt = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
+    line += f", cloud to surface {millimetres(row['rms_distance_m'])}, net force {force:.3f} ± {doubt:.3f} N"
+    line += f", {1e3 * row['seconds']:.0f} ms"
+    if "error" in row:
+        line += f", error {millimetres(row['error']['mean'])}"
+    for name, target in row["targets"].items():
+        line += f", {name} moved {millimetres(target['movement_m'], 1)}"
+        line += f" ({millimetres(target['error_m'])} off)" if "error_m" in target else ""
+    return line
+
+
+def millimetres(metres: float, digits: int = 2) -> str:
+    """A length for a person; `unknown` where there is none."""
+    return f"{1e3 * metres:.{digits}f} mm" if math.isfinite(metres) else "unknown"
+
+
+def remove_record(folder: Path) -> None:
+    """Remove the record of an earlier sequence and the files that it lists, and nothing else."""
+    path = folder / RECORD
+    if not path.is_file():
+        return
+    try:
+        rows = json.loads(path.read_text())["frames"]
+        files = [name for row in rows for name in row.get("files", [])]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        files = []  # damaged, or written by something else: whatever lies there stays
+    for name in (*files, SERIES, RECORD):
+        if isinstance(name, str) and Path(name).name == name:
+            (folder / name).unlink(missing_ok=True)

@@ -1,0 +1,454 @@
+"""A twin in Python: open a folder, predict, register a cloud or a stream of them, ask where the structures are."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softtwin.meshes.body import Body, Surface
+from softtwin.meshes.clouds import CloudError
+from softtwin.meshes.embedding import Embedding, target_points
+from softtwin.meshes.export import Coordinates
+from softtwin.meshes.files import read_body
+from softtwin.reference.loads import loaded_nodes
+from softtwin.reference.outcome import NotConverged
+from softtwin.registration.evidence import Scale
+from softtwin.registration.forward import ForwardModel, State
+from softtwin.registration.gauss_newton import GaussNewton
+from softtwin.registration.lbfgs import LBFGS
+from softtwin.registration.pose import Pose
+from softtwin.registration.registrar import (
+    NOISE,
+    Registrar,
+    Registration,
+    RegistrationOptions,
+    expected_force,
+    prepare,
+    rounds_for,
+)
+from softtwin.registration.rigid import align
+from softtwin.registration.thinning import thinned
+from softtwin.registration.unknowns import PosePrior
+from softtwin.registration.verdict import Judgement, Verdict
+
+from .config import Config, ConfigError, RegistrationSection, parse_config
+from .inputs import check_material, load_plan
+from .workspace import open_workspace
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+Camera = Pose | PosePrior | Literal["align"] | None
+"""Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
+is first looked for in the clouds themselves, None for clouds in the coordinates of the body at rest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One cloud of a sequence.
+
+    Args:
+        number: of the frame, from 0.
+        judgement: whether the result can be used, and why not.
+        registration: what was found; None where the cloud cannot be registered at all.
+        seconds: wall time, that of a search for the pose included.
+        cloud: points that were used, after thinning, (p, 3), metres; None as above.
+    """
+
+    number: int
+    judgement: Judgement
+    registration: Registration | None
+    seconds: float
+    cloud: Floats | None = None
+
+
+class Twin:
+    """A body with a forward model, ready to predict and to register; all lengths are metres.
+
+    `Twin.open` reads one from a folder; with a forward model of your own, build it directly. Use it in a `with`
+    statement where the model is the reference: FEniCSx' objects are given back at its end.
+
+    Args:
+        model: forward model.
+        config: settings; `config.registration` says how clouds are registered.
+        resources: what is given back when the twin is closed.
+    """
+
+    def __init__(self, model: ForwardModel, config: Config | None = None, resources: ExitStack | None = None) -> None:
+        self._model: ForwardModel | None = model
+        self._body = model.body
+        self.config = config or Config()
+        self._resources = resources or ExitStack()
+        self._registrars: dict[str, Registrar] = {}
+        self._posed: tuple[str, PosePrior, Registrar] | None = None
+
+    @classmethod
+    def open(cls, folder: Path | str, model: str = "", **options: Any) -> Twin:
+        """The twin of a folder.
+
+        Args:
+            folder: a twin; a folder with a body and its configuration, without a network; or a configuration file.
+            model: `surrogate` or `reference`; what the twin's configuration says if not given.
+            options: entries of the configuration's [registration] that replace what it says (`noise=1e-3`, ...).
+
+        Raises:
+            ConfigError: the folder is no twin, has no surrogate, or an option cannot be.
+            TwinError: the surrogate is damaged, or of another body.
+        """
+        return find_twin(folder).twin(model, **options)
+
+    def close(self) -> None:
+        """Give back what the model holds; the twin is of no use afterwards, nor are derivatives of its states."""
+        self._model = None  # FEniCSx ends the process that uses what was given back
+        self._registrars.clear()
+        self._posed = None
+        self._resources.close()
+
+    def __enter__(self) -> Twin:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    @property
+    def model(self) -> ForwardModel:
+        """The forward model.
+
+        Raises:
+            RuntimeError: the twin has been closed.
+        """
+        if self._model is None:
+            raise RuntimeError("twin: expected an open twin, got one that was closed; open it again.")
+        return self._model
+
+    @property
+    def body(self) -> Body:
+        """The body at rest, metres."""
+        return self._body
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """Unit and axes of the files that the body was made from."""
+        return coordinates_of(self.config)
+
+    def predict(self, forces: ArrayLike) -> State:
+        """The state under nodal forces: `displacement`, (n, 3), metres, and its derivatives.
+
+        Args:
+            forces: (n, 3), newtons, in the body's node order.
+        """
+        return self.model.solve(forces)
+
+    def register(
+        self, cloud: ArrayLike, zone: str | None = None, start: Registration | None = None, camera: Camera = None
+    ) -> Registration:
+        """The forces and the state that explain a cloud, with a verdict on them.
+
+        Args:
+            cloud: observed points, (p, 3), metres.
+            zone: node set whose nodes may carry force; empty for all loaded nodes; what the configuration says if not
+                given.
+            start: result of an earlier frame to start from; no force if not given.
+            camera: where the camera stands.
+
+        Raises:
+            ConfigError: no such zone.
+            CloudError: a cloud that is empty, holds NaN, lies too far from the body, or shows no one pose.
+            NotConverged: the model found no state at the start.
+        """
+        if camera == "align":
+            camera = self.aligned(cloud)
+        if isinstance(camera, Pose):
+            inner = camera.inverse().apply(np.asarray(cloud, dtype=np.float64))
+            return replace(self.registrar(zone).register(inner, start), pose=camera)
+        return self.registrar(zone, camera).register(cloud, start)
+
+    def stream(self, clouds: Iterable[ArrayLike], zone: str | None = None, camera: Camera = None) -> Iterator[Frame]:
+        """Clouds registered in their order as they come, each from the last result that was not refused.
+
+        A cloud that cannot be registered gives a refused frame with the reason, and the stream goes on.
+
+        Args:
+            clouds: one cloud a frame, (p, 3), metres.
+            zone: as for `register`.
+            camera: where the camera stands, for all clouds; `align` looks for it in the first that shows it.
+
+        Raises:
+            ConfigError: no such zone.
+        """
+        sequence = Sequence(self, zone, camera)
+        for cloud in clouds:
+            yield sequence.register(cloud)
+
+    def targets(self, result: Registration) -> dict[str, Floats]:
+        """Where the vertices of each inner surface are after a registration, (p, 3), metres, by name.
+
+        In the coordinates of the body at rest; `result.pose.apply` takes them to the camera's.
+        """
+        return {name: surface.points for name, surface in self._inner(result).items()}
+
+    def surfaces(self, result: Registration) -> dict[str, Surface]:
+        """The moved surface of each structure, metres, by name: the organ's first, then the inner ones."""
+        outer = "organ" if "organ" not in self.body.inner else "organ surface"
+        moved = Surface(self.body.points + result.displacement, self.body.boundary)
+        return {outer: moved, **self._inner(result)}
+
+    def _inner(self, result: Registration) -> dict[str, Surface]:
+        return {
+            name: Surface(surface.points + self.embeddings[name].displace(result.displacement), surface.triangles)
+            for name, surface in self.body.inner.items()
+        }
+
+    @cached_property
+    def embeddings(self) -> dict[str, Embedding]:
+        """How the body carries the vertices of each inner surface, by name."""
+        return target_points(self.body)
+
+    def aligned(self, cloud: ArrayLike) -> PosePrior:
+        """An unknown pose about the one that a cloud alone shows.
+
+        Args:
+            cloud: (p, 3), metres.
+
+        Raises:
+            CloudError: no pose explains the cloud, or more than one does.
+        """
+        found = align(Surface(self.body.points, self._seen), cloud)
+        if not found.is_found:
+            raise CloudError(f"cloud: the pose was not found ({found.outcome.value}). {found.outcome.advice}")
+        return self.near(found.pose)
+
+    @property
+    def _seen(self) -> Ints:
+        """The side that a camera sees, (t, 3)."""
+        return self.body.surfaces.get("observed", self.body.boundary)
+
+    def near(self, pose: Pose) -> PosePrior:
+        """An unknown pose about an expected one, with the deviations of the configuration."""
+        options = self.config.registration
+        return PosePrior(
+            pose,
+            self.body.points[np.unique(self._seen)].mean(axis=0),
+            np.deg2rad(options.pose_turn),
+            options.pose_shift,
+        )
+
+    def registrar(self, zone: str | None = None, camera: PosePrior | None = None) -> Registrar:
+        """What registers clouds with forces in a zone; prepared once (about a second), then kept.
+
+        Args:
+            zone: as for `register`.
+            camera: prior of an unknown pose; None for clouds in the body's coordinates.
+
+        Raises:
+            ConfigError: no such zone.
+        """
+        zone = self.config.registration.zone if zone is None else zone
+        if camera is not None:
+            if self._posed is None or self._posed[0] != zone or self._posed[1] is not camera:
+                self._posed = zone, camera, self._prepared(zone, camera)
+            return self._posed[2]
+        if zone not in self._registrars:
+            self._registrars[zone] = self._prepared(zone, None)
+        return self._registrars[zone]
+
+    def _prepared(self, zone: str, camera: PosePrior | None) -> Registrar:
+        body, section = self.body, self.config.registration
+        if camera is not None:
+            plain = self.registrar(zone)
+            return Registrar(self.model, plain.observed, plain.forces, plain.options, pose=camera)
+        if zone and zone not in body.node_sets:
+            raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
+        return prepare(
+            self.model,
+            body.node_sets[zone] if zone else loaded_nodes(body, load_plan(self.config)),
+            body.surfaces.get("observed"),
+            force_scale=section.force_scale or expected_force(body, self.config.material.young_modulus),
+            smoothness=section.smoothness,
+            directions=section.directions,
+            options=_options(section, rounds_for(self.model, bool(zone))),
+        )
+
+
+class Sequence:
+    """Frames of one twin, each registered from what the last usable one found.
+
+    Args:
+        twin: the twin.
+        zone: as for `Twin.register`.
+        camera: where the camera stands.
+    """
+
+    def __init__(self, twin: Twin, zone: str | None = None, camera: Camera = None) -> None:
+        self.twin, self.zone, self.camera = twin, zone, camera
+        self._last: Registration | None = None
+        self._count = 0
+        twin.registrar(zone)  # a zone that is not there is said before the first cloud
+
+    def register(self, cloud: ArrayLike) -> Frame:
+        """The next frame; refused, with the reason, where the cloud cannot be registered."""
+        begin = time.perf_counter()
+        points = self._thinned(cloud)
+        try:
+            if self.camera == "align":
+                self.camera = self.twin.aligned(points)
+            result = self._registered(points)
+        except (CloudError, NotConverged) as error:
+            return self.refuse(str(error), time.perf_counter() - begin)
+        if result.judgement.is_usable:
+            self._last = result
+        return Frame(self._next(), result.judgement, result, time.perf_counter() - begin, points)
+
+    def _thinned(self, cloud: ArrayLike) -> Floats:
+        """Once for all that is tried with it; what is no cloud is left for the registrar to refuse."""
+        points = np.asarray(cloud, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            return points
+        return points[thinned(points, self.twin.config.registration.points)]
+
+    def _registered(self, cloud: ArrayLike) -> Registration:
+        """From the last frame; what is not accepted is tried from rest too, lest one bad frame spoil those after it."""
+        warm = None
+        if self._last is not None:
+            with suppress(NotConverged):
+                warm = self.twin.register(cloud, self.zone, self._last, self.camera)
+            if warm is not None and (warm.judgement.verdict is Verdict.ACCEPTED or self._began_anew(warm)):
+                return warm
+        cold = self.twin.register(cloud, self.zone, None, self.camera)
+        return cold if warm is None else min(warm, cold, key=_badness)
+
+    def _began_anew(self, result: Registration) -> bool:
+        """True where the registrar itself has gone back to rest: its forces were gathered again."""
+        return self._last is not None and result.prepared is not self._last.prepared
+
+    def refuse(self, reason: str, seconds: float = 0.0) -> Frame:
+        """The next frame without a result: its cloud cannot be used.
+
+        Args:
+            reason: why.
+            seconds: wall time spent on it.
+        """
+        return Frame(self._next(), Judgement(Verdict.REFUSED, (reason,)), None, seconds)
+
+    def _next(self) -> int:
+        self._count += 1
+        return self._count - 1
+
+
+def _badness(result: Registration) -> tuple[int, float]:
+    return list(Verdict).index(result.judgement.verdict), result.noise
+
+
+def _options(section: RegistrationSection, rounds: int) -> RegistrationOptions:
+    spread = 0.0 if section.noise_known else NOISE.spread
+    noise = Scale(section.noise, spread, least=min(NOISE.least, section.noise))
+    solver = LBFGS() if section.solver == "l-bfgs" else GaussNewton()
+    if section.max_iterations:
+        solver = replace(solver, max_iterations=section.max_iterations)
+    return RegistrationOptions(noise, solver, section.points, rounds if section.rounds < 0 else section.rounds)
+
+
+def with_options(config: Config, options: dict[str, Any]) -> Config:
+    """The configuration with other entries in its [registration].
+
+    Raises:
+        ConfigError: an entry is unknown or out of range.
+    """
+    entries = config.model_dump()
+    entries["registration"] |= options
+    return parse_config(entries, "registration")
+
+
+def coordinates_of(config: Config) -> Coordinates:
+    """Unit and axes of the files that a body was made from."""
+    return Coordinates(config.body.unit, "ras" if getattr(config.body, "frame", "").lower() == "ras" else "lps")
+
+
+@dataclass(frozen=True, eq=False)
+class Home:
+    """What was found where a twin was looked for.
+
+    Args:
+        folder: that holds the surrogate, if there is one.
+        body: the body.
+        config: the configuration.
+    """
+
+    folder: Path
+    body: Body
+    config: Config
+
+    def twin(self, model: str = "", **options: Any) -> Twin:
+        """The twin that is here; see `Twin.open`."""
+        config = with_options(self.config, {**options, **({"model": model} if model else {})})
+        resources = ExitStack()
+        chosen = resources.enter_context(forward_model(config.registration.model, self.folder, self.body, config))
+        return Twin(chosen, config, resources)
+
+
+def find_twin(place: Path | str) -> Home:
+    """The body, the configuration and the folder of a twin.
+
+    Args:
+        place: a twin's folder, the folder that its stages were run in, or the configuration file of that.
+
+    Raises:
+        ConfigError: the place is none of them, or its material is not the one that its surrogate has learned.
+    """
+    place = Path(place)
+    if place.is_file():
+        space = open_workspace(place)
+        file, config, folder = space.body, space.config, space.twin
+    else:
+        inner = place / "twin"
+        folder = inner if (inner / "organ.toml").is_file() and not (place / "surrogate.json").is_file() else place
+        missing = [name for name in ("body.vtu", "organ.toml") if not (folder / name).is_file()]
+        if missing:
+            raise ConfigError(
+                f"twin: expected a twin folder with {' and '.join(missing)} in {place}; make one with `softtwin build`."
+            )
+        file, config = folder / "body.vtu", open_workspace(folder / "organ.toml").config
+    if not file.is_file():
+        raise ConfigError(f"twin: expected the body in {file}, found none; run `softtwin mesh {place}` first.")
+    check_material(folder, config)
+    return Home(folder, read_body(file), config)
+
+
+@contextmanager
+def forward_model(name: str, folder: Path, body: Body, config: Config) -> Iterator[ForwardModel]:
+    """The forward model that registers: the twin's surrogate, or the reference where FEniCSx is installed.
+
+    Args:
+        name: `surrogate` or `reference`.
+        folder: the twin.
+        body: its body.
+        config: its configuration; gives the reference its material.
+
+    Raises:
+        ConfigError: there is no surrogate.
+    """
+    if name == "surrogate":
+        if not (folder / "surrogate.json").is_file():
+            raise ConfigError(
+                f"twin: expected a surrogate in {folder}, found no surrogate.json; train one with `softtwin build`, "
+                "or register with the reference (--model reference), which needs the body alone, and FEniCSx."
+            )
+        from softtwin.surrogate.predictor import load  # torch is needed here alone
+
+        yield load(folder, body)
+        return
+    from softtwin.reference.equilibrium import NewtonOptions, Problem
+    from softtwin.reference.materials import MATERIALS
+    from softtwin.reference.model import ReferenceModel  # FEniCSx is needed here alone
+
+    material = MATERIALS[config.material.law](config.material.young_modulus, config.material.poisson_ratio)
+    with Problem(body, material, NewtonOptions(tolerance=1e-5, max_iterations=15)) as problem:
+        yield ReferenceModel(problem, patient=False)

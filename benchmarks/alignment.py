@@ -1,0 +1,156 @@
+"""A rigid start found from a partial cloud alone: how often, how near, and how often it is wrong without saying so.
+
+    python benchmarks/alignment.py [--draws 40]
+
+Views of the real liver as the tool has bent it (any frame of s1-s3, any direction, 500 points, 1 mm of noise, any
+pose), cut to a share of the organ's area: 50 % is all that one view shows (about 40 to 50 %). Errors are mean
+distances of the true node positions. Where the organ is bent under the cloud no rigid pose is near; `matched` says
+what one would find that knew which point of the cloud is which of the organ. Then clouds for which every pose is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from liver import SEQUENCES, liver, sequence
+from numpy.typing import NDArray
+from record import write
+from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
+
+from softtwin.meshes.body import Surface
+from softtwin.meshes.clouds import visible_triangles
+from softtwin.meshes.shapes import liver_phantom
+from softtwin.registration.pose import Pose, from_landmarks
+from softtwin.registration.rigid import Alignment, Outcome, align
+
+Floats = NDArray[np.float64]
+SHARES = (0.50, 0.25, 0.08)
+NEAR, FAR = 0.015, 0.030  # metres: a good start; another pose
+POINTS, NOISE, OUTLIERS, OUTLIER_REACH = 500, 1e-3, 0.1, 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A cloud in the camera's coordinates with what is true of it."""
+
+    cloud: Floats
+    pose: Pose
+    positions: Floats
+    matched: Pose
+
+
+def view(rest: Floats, moved: Floats, triangles: NDArray[np.int64], share: float, rng: np.random.Generator) -> View:
+    """What a camera sees of a moved organ, the part around a random place that makes up a share of the area."""
+    surface = Surface(moved, triangles)
+    corners = moved[triangles]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    seen = np.flatnonzero(visible_triangles(surface, rng.normal(size=3)))
+    centroids = corners[seen].mean(axis=1)
+    seen = seen[np.argsort(np.linalg.norm(centroids - centroids[rng.integers(len(seen))], axis=1))]
+    seen = seen[: 1 + np.searchsorted(np.cumsum(areas[seen]), share * areas.sum())]
+    chosen = triangles[rng.choice(seen, POINTS, p=areas[seen] / areas[seen].sum())]
+    root, s = np.sqrt(rng.random(POINTS)), rng.random(POINTS)
+    weights = np.stack([1 - root, root * (1 - s), root * s], axis=1)
+    pose = Pose(Rotation.random(random_state=int(rng.integers(2**31))).as_matrix(), 0.3 * rng.normal(size=3))
+    material, places = (np.einsum("pk,pki->pi", weights, points[chosen]) for points in (rest, pose.apply(moved)))
+    names = [str(i) for i in range(POINTS)]
+    matched = from_landmarks(dict(zip(names, material, strict=True)), dict(zip(names, places, strict=True))).pose
+    return View(places + NOISE * rng.standard_normal(places.shape), pose, moved, matched)
+
+
+def with_outliers(cloud: Floats, rng: np.random.Generator) -> Floats:
+    """The cloud with a tenth of its points moved by up to 30 mm along each axis."""
+    wild = rng.random(len(cloud)) < OUTLIERS
+    return cloud + wild[:, None] * rng.uniform(-OUTLIER_REACH, OUTLIER_REACH, cloud.shape)
+
+
+def timed(surface: Surface, cloud: Floats) -> tuple[Alignment, float, float]:
+    """An alignment, its seconds, and its processor's seconds, which a busy machine does not stretch."""
+    start, spent = time.perf_counter(), time.process_time()
+    return align(surface, cloud), time.perf_counter() - start, time.process_time() - spent
+
+
+def of_liver(surface: Surface, views: list[View], clouds: list[Floats]) -> dict[str, Any]:
+    """Shares over views whose true pose is known."""
+    runs = [timed(surface, cloud) for cloud in clouds]
+    errors = np.array([a.pose.distance_to(v.pose, v.positions) for (a, *_), v in zip(runs, views, strict=True)])
+    matched = np.array([v.matched.distance_to(v.pose, v.positions) for v in views])
+    found = np.array([alignment.is_found for alignment, *_ in runs])
+    return {
+        "draws": len(runs),
+        "within_15_mm": float(np.mean(errors < NEAR)),
+        "matched_within_15_mm": float(np.mean(matched < NEAR)),
+        "within_30_mm": float(np.mean(errors < FAR)),
+        "found": float(np.mean(found)),
+        "found_within_15_mm": float(np.mean(found & (errors < NEAR))),
+        "found_beyond_15_mm": float(np.mean(found & (errors >= NEAR))),
+        "found_beyond_30_mm": float(np.mean(found & (errors >= FAR))),
+        "median_error_of_found_m": float(np.median(errors[found])) if found.any() else None,
+        "seconds_median": float(np.median([seconds for _, seconds, _ in runs])),
+        "processor_seconds_median": float(np.median([seconds for *_, seconds in runs])),
+        "outcomes": outcomes([alignment for alignment, *_ in runs]),
+    }
+
+
+def outcomes(alignments: list[Alignment]) -> dict[str, int]:
+    """How often each outcome came."""
+    return {outcome.value: sum(a.outcome is outcome for a in alignments) for outcome in Outcome}
+
+
+def impossible(draw: Callable[[np.random.Generator], Floats], surface: Surface, draws: int) -> dict[str, Any]:
+    """Outcomes for clouds that no pose explains or that say nothing of it."""
+    alignments = [align(surface, draw(np.random.default_rng([3, i]))) for i in range(draws)]
+    return {"draws": draws, "found": float(np.mean([a.is_found for a in alignments])), "outcomes": outcomes(alignments)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=40)
+    draws = parser.parse_args().draws
+    body, phantom = liver(), liver_phantom()
+    frames = np.concatenate([sequence(name).positions for name in SEQUENCES])
+    surface = body.boundary_surface
+
+    def seen(share: float, rng: np.random.Generator) -> View:
+        return view(body.points, frames[rng.integers(len(frames))], body.boundary, share, rng)
+
+    def other(share: float) -> Callable[[np.random.Generator], Floats]:
+        return lambda rng: view(phantom.points, phantom.points, phantom.boundary, share, rng).cloud
+
+    def mirrored(share: float) -> Callable[[np.random.Generator], Floats]:
+        return lambda rng: seen(share, rng).cloud * np.array([-1.0, 1.0, 1.0])
+
+    def line(rng: np.random.Generator) -> Floats:
+        return np.outer(rng.uniform(-0.1, 0.1, POINTS), rng.normal(size=3)) + NOISE * rng.normal(size=(POINTS, 3))
+
+    def plane(rng: np.random.Generator) -> Floats:
+        return rng.uniform(-0.05, 0.05, (POINTS, 3)) * [1, 1, 0] + NOISE * rng.normal(size=(POINTS, 3))
+
+    def box(rng: np.random.Generator) -> Floats:
+        return rng.uniform(-0.1, 0.1, (POINTS, 3))
+
+    figures: dict[str, Any] = {"points": POINTS, "noise_m": NOISE, "liver": {}, "outliers": {}, "impossible": {}}
+    with threadpool_limits(1):
+        for share in SHARES:
+            views = [seen(share, np.random.default_rng([1, i])) for i in range(draws)]
+            wild = [with_outliers(v.cloud, np.random.default_rng([2, i])) for i, v in enumerate(views)]
+            for kind, clouds in (("liver", [v.cloud for v in views]), ("outliers", wild)):
+                figures[kind][f"{share:.0%}"] = row = of_liver(surface, views, clouds)
+                print(f"{kind:9} {share:4.0%}", {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()},
+                      flush=True)  # fmt: skip
+        cases = {f"mirrored {share:.0%}": mirrored(share) for share in SHARES}
+        cases |= {f"another organ {share:.0%}": other(share) for share in SHARES}
+        for name, draw in (cases | {"line": line, "plane": plane, "box": box}).items():
+            figures["impossible"][name] = row = impossible(draw, surface, max(1, draws // 2))
+            print(f"{name:18}", row, flush=True)
+    write("alignment", figures)
+
+
+if __name__ == "__main__":
+    main()

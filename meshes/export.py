@@ -1,0 +1,158 @@
+"""Surfaces and time series out: STL, PLY and VTP in the coordinates that the files came in, PVD for ParaView."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import ArrayLike
+from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+from vtkmodules.vtkCommonCore import vtkPoints
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+from vtkmodules.vtkIOGeometry import vtkSTLWriter
+from vtkmodules.vtkIOPLY import vtkPLYWriter
+from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+from .body import Floats, Ints, Surface
+from .files import FileError, Frame, Unit
+
+SURFACE_FORMATS = ("stl", "ply", "vtp")
+_PER_METRE: Mapping[str, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+_TURN: Mapping[str, Floats] = {"lps": np.ones(3), "ras": np.array([-1.0, -1.0, 1.0])}
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """The coordinates that files come in and go out in; inside they are metres and LPS.
+
+    Args:
+        unit: unit of length.
+        axes: `lps` is kept, `ras` has x and y of the other sign.
+    """
+
+    unit: Unit = "m"
+    axes: Frame = "lps"
+
+    def __post_init__(self) -> None:
+        if self.unit not in _PER_METRE or self.axes not in _TURN:
+            raise ValueError(f"Coordinates: expected m, cm or mm and lps or ras, got {self.unit!r} and {self.axes!r}.")
+
+    def lengths(self, vectors: ArrayLike) -> Floats:
+        """Points or displacements in these coordinates, (..., 3), from metres and LPS."""
+        return _PER_METRE[self.unit] * self.directions(vectors)
+
+    def directions(self, vectors: ArrayLike) -> Floats:
+        """Vectors of another unit (forces) on these axes, (..., 3)."""
+        return _TURN[self.axes] * np.asarray(vectors, dtype=np.float64)
+
+    def metres(self, lengths: ArrayLike) -> Floats:
+        """Points or displacements in metres and LPS, (..., 3), from these coordinates."""
+        return _TURN[self.axes] * np.asarray(lengths, dtype=np.float64) / _PER_METRE[self.unit]
+
+    def motion(self, matrix: ArrayLike) -> Floats:
+        """A rigid motion of metres and LPS as one of these axes, in metres, (4, 4); and back: it is its own inverse."""
+        turn = np.append(_TURN[self.axes], 1.0)
+        return turn[:, None] * np.asarray(matrix, dtype=np.float64) * turn
+
+
+def write_surface(path: str | Path, surface: Surface, fields: Mapping[str, ArrayLike] | None = None) -> None:
+    """Write a triangle surface; the file appears whole or not at all.
+
+    Vertices that no triangle uses are left out.
+
+    Args:
+        path: file to write: `.stl` and `.ply` (binary, single precision) or `.vtp` (double precision).
+        surface: the surface, in the coordinates that are to be written.
+        fields: arrays with a row for each vertex, by name; VTP alone keeps them.
+
+    Raises:
+        FileError: another suffix, or the file could not be written.
+    """
+    used, local = np.unique(surface.triangles, return_inverse=True)
+    chosen = {name: np.asarray(field)[used] for name, field in (fields or {}).items()}
+    _write(Path(path), _polygons(surface.points[used], local.reshape(-1, 3), chosen))
+
+
+def write_points(path: str | Path, points: ArrayLike, fields: Mapping[str, ArrayLike] | None = None) -> None:
+    """Write a cloud of points, (p, 3); otherwise as `write_surface`, of which STL knows no points.
+
+    Args:
+        path: file to write: `.ply` or `.vtp`.
+        points: (p, 3), in the coordinates that are to be written.
+        fields: arrays with a row for each point, by name; VTP alone keeps them.
+
+    Raises:
+        FileError: another suffix, or the file could not be written.
+    """
+    positions = np.asarray(points, dtype=np.float64)
+    path = Path(path)
+    if path.suffix.lower() == ".stl":
+        raise FileError(f"{path}: expected the suffix .ply or .vtp, got '.stl': it holds triangles alone.")
+    _write(path, _polygons(positions, np.arange(len(positions))[:, None], fields or {}))
+
+
+def _polygons(points: Floats, cells: Ints, fields: Mapping[str, ArrayLike]) -> vtkPolyData:
+    """Triangles, (t, 3), or single points, (p, 1)."""
+    data, places, array = vtkPolyData(), vtkPoints(), vtkCellArray()
+    places.SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=True))
+    offsets = np.arange(0, cells.size + 1, cells.shape[1])
+    numbers = cells.ravel().astype(np.int64)
+    array.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(numbers, deep=True))
+    data.SetPoints(places)
+    if cells.shape[1] == 1:
+        data.SetVerts(array)
+    else:
+        data.SetPolys(array)
+    for name, field in fields.items():
+        values = numpy_to_vtk(np.ascontiguousarray(field), deep=True)
+        values.SetName(name)
+        data.GetPointData().AddArray(values)
+    return data
+
+
+def _write(path: Path, data: vtkPolyData) -> None:
+    suffix = path.suffix.lower()
+    writers: Mapping[str, Any] = {".stl": vtkSTLWriter, ".ply": vtkPLYWriter, ".vtp": vtkXMLPolyDataWriter}
+    if suffix not in writers:
+        raise FileError(f"{path}: expected the suffix {', '.join(writers)}, got {path.suffix!r}.")
+    partial = path.with_name(f".partial.{path.name}")  # VTK's PLY writer adds a suffix to any name without its own
+    writer = writers[suffix]()
+    writer.SetFileName(str(partial))
+    if suffix == ".vtp":
+        writer.SetDataModeToAppended()
+        writer.EncodeAppendedDataOff()
+    else:
+        writer.SetFileTypeToBinary()
+        for name in [data.GetPointData().GetArrayName(i) for i in range(data.GetPointData().GetNumberOfArrays())]:
+            data.GetPointData().RemoveArray(name)
+    writer.SetInputData(data)
+    if not path.parent.is_dir() or not writer.Write() or not partial.is_file():
+        partial.unlink(missing_ok=True)
+        raise FileError(f"{path}: could not be written; is the folder there, and is the disk full?")
+    os.replace(partial, path)
+
+
+def write_series(path: str | Path, files: Iterable[tuple[float, str, str]]) -> None:
+    """Write a PVD that ParaView opens as a time series; the file appears whole or not at all.
+
+    Args:
+        path: file to write, `.pvd`.
+        files: time, name of the part, and file (VTU or VTP, relative to the PVD) of each piece.
+    """
+    path = Path(path)
+    pieces = list(files)
+    numbers = {name: i for i, name in enumerate(dict.fromkeys(name for _, name, _ in pieces))}
+    lines = [
+        f'    <DataSet timestep="{time:g}" group="" part="{numbers[name]}" name={quoteattr(name)} '
+        f"file={quoteattr(file)}/>"
+        for time, name, file in pieces
+    ]
+    head = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">']
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text("\n".join([*head, "  <Collection>", *lines, "  </Collection>", "</VTKFile>", ""]))
+    os.replace(partial, path)

@@ -1,0 +1,145 @@
+"""The reference as a forward model for registration: forces to a state, which carries its own exact derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softtwin.meshes.body import Body
+
+from .equilibrium import Problem
+from .loading import Loading, checked_array
+from .materials import Material
+from .outcome import Equilibrium
+
+Floats = NDArray[np.float64]
+
+
+class Start(Protocol):
+    """Any forward model's state, as far as a search starts from it."""
+
+    @property
+    def displacement(self) -> Floats:
+        """Of the nodes, (n, 3), metres."""
+
+
+class ReferenceModel:
+    """Forces to equilibrium by finite elements.
+
+    It remembers no state: what a solve found is the value that it returns.
+
+    Args:
+        problem: body, material and options; stays owned by the caller.
+        patient: try every other way where the state to start from is too far; False refuses at once, for a search that
+            can shorten its step.
+        loading: what acts beside the nodal forces at all times (weight, pressures, prescribed displacements).
+    """
+
+    def __init__(self, problem: Problem, patient: bool = True, loading: Loading | None = None) -> None:
+        self.problem, self.patient, self.loading = problem, patient, loading or Loading()
+
+    @property
+    def body(self) -> Body:
+        """The body that deforms."""
+        return self.problem.body
+
+    @property
+    def error(self) -> float:
+        """0: it is what others are measured by."""
+        return 0.0
+
+    def solve(self, forces: ArrayLike, near: Start | None = None) -> ReferenceState:
+        """The state under nodal forces, (n, 3) newtons.
+
+        Args:
+            forces: nodal forces.
+            near: a state to start from; one of this model's is first moved along its tangent by the change of the
+                forces. The warped linear response if not given.
+
+        Raises:
+            NotConverged: no equilibrium was found; states that were found before stay as they are.
+        """
+        given = checked_array("ReferenceModel.forces", forces, self.body.points.shape).copy()
+        given.flags.writeable = False
+        fixed = self.loading.forces
+        load = replace(self.loading, forces=given if fixed is None else given + np.asarray(fixed))
+        start = near.equilibrium if isinstance(near, ReferenceState) else None if near is None else near.displacement
+        found = self.problem.solve(load, start, stability=False, fallback=self.patient or start is None)
+        return ReferenceState(given, found, self, self.problem.material)
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceState:
+    """An equilibrium with its derivatives, which share one factorisation.
+
+    The problem keeps the factorisation of one state: two states used by turns are right, and factored by turns.
+
+    Args:
+        forces: nodal forces in balance, (n, 3), newtons.
+        equilibrium: what they led to.
+        model: where it was found.
+        material: that the body had then.
+    """
+
+    forces: Floats
+    equilibrium: Equilibrium
+    model: ReferenceModel
+    material: Material
+
+    @property
+    def displacement(self) -> Floats:
+        """Of the nodes, (n, 3), metres."""
+        return self.equilibrium.displacement
+
+    @property
+    def extent(self) -> None:
+        """None: the reference has learned nothing that it could leave."""
+
+    @cached_property
+    def negative_pivots(self) -> int | None:
+        """Negative pivots of the tangent, counted when first asked for: 0 is stable, None is not known."""
+        if self.equilibrium.negative_pivots is not None:
+            return self.equilibrium.negative_pivots
+        return self._problem.negative_pivots(self.equilibrium)
+
+    @property
+    def _problem(self) -> Problem:
+        """The problem, while its tangents are still this state's."""
+        problem = self.model.problem
+        if problem.material is not self.material:
+            raise RuntimeError(
+                f"ReferenceState: expected the material that it was found with, {self.material!r}, "
+                f"got {problem.material!r}; solve again after set_material."
+            )
+        return problem
+
+    def push(self, changes: ArrayLike) -> Floats:
+        """Changes of the displacement, (3n, k), for small changes of the forces, (3n, k).
+
+        Raises:
+            RuntimeError: the problem has been given another material since.
+        """
+        return self._problem.apply_inverse(changes, self.equilibrium)
+
+    def pull(self, cotangent: ArrayLike) -> Floats:
+        """Gradient with respect to the forces, (n, 3), from the one with respect to the displacement.
+
+        It is the adjoint K^-T g at this state (Odot 2023, eq. 6.8-6.10), zero at fixed nodes.
+
+        Args:
+            cotangent: g, (n, 3), or several, (k, n, 3).
+
+        Raises:
+            ValueError: another shape.
+            RuntimeError: the problem has been given another material since.
+        """
+        given = np.asarray(cotangent, dtype=np.float64)
+        shape = self.model.body.points.shape
+        if given.ndim not in (2, 3) or given.shape[-2:] != shape:
+            raise ValueError(f"State.pull: expected a cotangent of shape {shape} or (k, *{shape}), got {given.shape}.")
+        columns = given.reshape(-1, self.model.body.points.size).T
+        return self._problem.apply_inverse(columns, self.equilibrium, transpose=True).T.reshape(given.shape)

@@ -1,0 +1,155 @@
+"""The noise of a cloud and the size of the forces, found from the cloud itself: evidence of a linearised problem.
+
+With residuals linearised about a state, data y = J c + noise have the evidence p(y | s, sigma) of a normal law with
+covariance sigma^2 W^-1 + s^2 J J^T (MacKay 1992), diagonal in the eigenvectors of J^T W J. It is taken on a grid of
+both scales with wide log-normal priors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+_STEP = 0.1  # of the logarithm of each scale on its grid
+_REACH = 3.5  # of the grid, in standard deviations of the prior
+_SEEN = 1e-13  # information relative to the largest, below which a direction is round-off
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What is believed of a positive scale beforehand: log-normal.
+
+    Args:
+        median: the scale expected.
+        spread: standard deviation of its logarithm; 0 for a scale that is known.
+        least: no smaller value is believed.
+    """
+
+    median: float
+    spread: float
+    least: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.median < np.inf and 0.0 <= self.spread < np.inf and 0.0 <= self.least < np.inf):
+            raise ValueError(f"Scale: expected a positive median, a spread and a least value of 0 or more, got {self}.")
+
+    def at_least(self, least: float) -> Scale:
+        """The same belief with a larger least value."""
+        return replace(self, least=max(self.least, least))
+
+    def grid(self) -> tuple[Floats, Floats]:
+        """Logarithms of values, multiples of one step, (g,), and the logarithm of their probability, (g,)."""
+        middle = np.log(max(self.median, self.least))
+        if self.spread == 0.0:
+            return np.round([middle / _STEP]) * _STEP, np.zeros(1)
+        low = middle - _REACH * self.spread
+        if self.least > 0.0:
+            low = max(low, np.log(self.least))
+        steps = np.arange(np.ceil(low / _STEP), np.floor((middle + _REACH * self.spread) / _STEP) + 1)
+        return _STEP * steps, -0.5 * ((_STEP * steps - np.log(self.median)) / self.spread) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A weighted linear problem y = J c + noise in the eigenvectors of J^T W J.
+
+    Args:
+        vectors: V, (k, k).
+        information: eigenvalues, (k,), 1/m^2 of unit noise: how strongly the data see each direction.
+        projections: V^T J^T W y, (k,).
+        rest: part of y^T W y that no coefficients explain.
+        count: points that carry weight.
+    """
+
+    vectors: Floats
+    information: Floats
+    projections: Floats
+    rest: float
+    count: float
+
+    def promised(self, scales: Scales, coefficients: Floats) -> float:
+        """Root mean square change of the residuals by the best step at some scales, metres.
+
+        Args:
+            scales: noise and force scale.
+            coefficients: at the state, (k,).
+        """
+        best = self.projections / (self.information + (scales.noise / scales.force) ** 2)
+        step = best - self.vectors.T @ coefficients
+        return float(np.sqrt(float(self.information @ step**2) / max(self.count, 1.0)))
+
+
+def linearised(
+    jacobian: Floats, residuals: Floats, weights: Floats, coefficients: Floats, consistency: float
+) -> Linearised:
+    """The linear problem about a state.
+
+    Args:
+        jacobian: derivative of the residuals by the coefficients, (p, k).
+        residuals: at the state, (p,), metres.
+        weights: of the points, (p,), between 0 and 1.
+        coefficients: at the state, (k,).
+        consistency: of the loss that gave the weights.
+    """
+    data = jacobian @ coefficients - residuals
+    weighted: Floats = weights[:, None] * jacobian
+    values, vectors = np.linalg.eigh(jacobian.T @ weighted)
+    values = np.maximum(np.asarray(values, dtype=np.float64), 0.0)
+    pulled: Floats = weighted.T @ data
+    projections = vectors.T @ pulled
+    seen = values > _SEEN * values.max(initial=0.0)
+    explained = float((projections[seen] ** 2 / values[seen]).sum())
+    rest = max(float(data @ (weights * data)) - explained, 0.0) / consistency
+    return Linearised(vectors, values, projections, rest, float(weights.sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class Scales:
+    """The two scales after the data.
+
+    Args:
+        noise: standard deviation of a point's distance, metres.
+        force: standard deviation of the coefficients.
+        spread: standard deviation of the logarithms of both, (2,).
+    """
+
+    noise: float
+    force: float
+    spread: tuple[float, float]
+
+
+def find_scales(problem: Linearised, noise: Scale, force: Scale) -> Scales:
+    """Posterior geometric means of noise and force scale.
+
+    Args:
+        problem: the linearised problem.
+        noise: prior of the noise.
+        force: prior of the coefficients' scale.
+    """
+    log_noise, noise_prior = noise.grid()
+    log_force, force_prior = force.grid()
+    seen = problem.information > _SEEN * problem.information.max(initial=0.0)
+    information, projections = problem.information[seen], problem.projections[seen]
+    # Both grids have one step: sums over the directions depend on the ratio of the scales alone.
+    ratios = _STEP * np.arange(
+        round((log_force[0] - log_noise[-1]) / _STEP), round((log_force[-1] - log_noise[0]) / _STEP) + 1
+    )
+    growth = 1.0 + np.exp(2.0 * ratios)[:, None] * information
+    logarithms, explained = np.log(growth).sum(axis=1), (projections**2 / information / growth).sum(axis=1)
+    index = np.arange(len(log_force))[None, :] - np.arange(len(log_noise))[:, None] + len(log_noise) - 1
+    count = float(max(problem.count, len(information) + 1.0))
+    chance = -0.5 * (logarithms[index] + (explained[index] + problem.rest) * np.exp(-2.0 * log_noise)[:, None])
+    chance += (noise_prior - count * log_noise)[:, None] + force_prior[None, :]
+    chance = np.exp(chance - chance.max())
+    chance /= chance.sum()
+    noise_found, noise_spread = _moments(log_noise, chance.sum(axis=1))
+    force_found, force_spread = _moments(log_force, chance.sum(axis=0))
+    return Scales(float(np.exp(noise_found)), float(np.exp(force_found)), (noise_spread, force_spread))
+
+
+def _moments(values: Floats, chance: Floats) -> tuple[float, float]:
+    mean = float(values @ chance)
+    return mean, float(np.sqrt(max(float((values - mean) ** 2 @ chance), 0.0)))

@@ -1,0 +1,282 @@
+"""Gauss-Newton in a trust region, with the scales of noise and forces found on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softtwin.reference.outcome import NotConverged
+
+from .evidence import Scales, find_scales, linearised
+from .loss import Huber, Loss, Tukey, robust_deviation
+from .outcome import Outcome
+from .posterior import Posterior, posterior
+from .problem import Problem, Trial
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One iteration.
+
+    Args:
+        rms_distance: of the cloud to the surface, metres.
+        objective: robust objective at the scales of this iteration.
+        noise: scale of the points' noise, metres.
+        force_scale: of the coefficients, newtons.
+        largest_movement: of an observed node, predicted, metres.
+        length: of the whole Gauss-Newton step in posterior deviations a coefficient.
+        gain: decrease of the objective over the one predicted.
+    """
+
+    rms_distance: float
+    objective: float
+    noise: float
+    force_scale: float
+    largest_movement: float
+    length: float
+    gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Where a solver ended.
+
+    Args:
+        trial: the problem at the coefficients returned.
+        weights: of the points at the end, (p,).
+        posterior: there.
+        outcome: how it ended.
+        evaluations: states solved for.
+        trace: one entry an iteration.
+    """
+
+    trial: Trial
+    weights: Floats
+    posterior: Posterior
+    outcome: Outcome
+    evaluations: int
+    trace: tuple[Step, ...]
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Trust-region Gauss-Newton on a robust loss.
+
+    The losses are taken one after the other: a convex one first, so that a part of the organ that has moved far is not
+    mistaken for outliers. Within each, scales are found anew from every linearisation. What a linear model promises to
+    change holds only in part: the noise is taken as at least that part of it, so that a far start does not overfit its
+    way into a wrong minimum.
+
+    Args:
+        losses: one after the other.
+        max_iterations: of all losses together.
+        settled: a step shorter than this, in posterior deviations a coefficient, is not taken: it has converged.
+        handed_on: the same for all losses but the last.
+        graduation: the noise is taken as at least this part of what the linear model promises to change.
+        max_step: first limit on the movement of any observed node in one step, metres.
+        least_step: no step that moves all observed nodes less than this is tried, metres.
+    """
+
+    losses: tuple[Loss, ...] = (Huber(), Tukey())
+    max_iterations: int = 40
+    settled: float = 0.2
+    handed_on: float = 1.0
+    graduation: float = 0.5
+    max_step: float = 16e-3
+    least_step: float = 1e-6
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1:
+            raise ValueError(f"GaussNewton.max_iterations: expected at least 1, got {self.max_iterations}.")
+        for name in ("settled", "handed_on", "max_step", "least_step"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f"GaussNewton.{name}: expected a positive number, got {getattr(self, name)}.")
+
+    def rough(self) -> GaussNewton:
+        """The same with the first loss alone, ended early: for a start."""
+        return replace(self, losses=self.losses[:1], settled=self.handed_on)
+
+    def solve(self, problem: Problem, start: Floats, near: Trial | None = None) -> Found:
+        """The coefficients that minimise the robust distance plus the prior.
+
+        Args:
+            problem: what is registered.
+            start: coefficients to start from, (k,).
+            near: a trial whose state is near the start's.
+
+        Raises:
+            NotConverged: the model found no state at the start.
+        """
+        return _Search(self, problem, start, near).run()
+
+
+class _Search:
+    """One run of the solver: where it is, how far it may step, what it has seen."""
+
+    def __init__(self, options: GaussNewton, problem: Problem, start: Floats, near: Trial | None) -> None:
+        self.options, self.problem = options, problem
+        self.trial = problem.trial(start, near, anew=near is None or near.cloud is not problem.cloud)
+        self.evaluations, self.limit = 1, options.max_step
+        self.noise = max(robust_deviation(self.trial.match.distances), problem.noise.least)
+        self.trace: list[Step] = []
+
+    def run(self) -> Found:
+        options = self.options
+        for loss in options.losses[:-1]:
+            self._descend(loss, options.handed_on)
+        outcome = self._descend(options.losses[-1], options.settled)
+        local = self._local(self.options.losses[-1])
+        return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
+
+    def _local(self, loss: Loss) -> LocalModel:
+        local = LocalModel(self.problem, self.trial, loss, self.noise, self.options.graduation)
+        self.noise = local.scales.noise
+        return local
+
+    def _descend(self, loss: Loss, settled: float) -> Outcome:
+        while len(self.trace) < self.options.max_iterations:
+            local = self._local(loss)
+            length = local.length
+            if length < settled and not local.is_graduated:
+                if settled >= self.options.handed_on or self._is_closest():
+                    return Outcome.CONVERGED
+                continue
+            refused = self._step(local, loss)
+            if refused is not None:
+                return refused
+        return Outcome.MOST_ITERATIONS
+
+    def _is_closest(self) -> bool:
+        """Search the closest points anew; True where that changes nothing beside the noise."""
+        before, self.trial = self.trial, self.problem.again(self.trial)
+        changed = np.abs(self.trial.match.distances - before.match.distances).max()
+        return bool(changed < 0.1 * self.noise)
+
+    def _step(self, local: LocalModel, loss: Loss) -> Outcome | None:
+        """Take the best step within the limit; None when one was taken."""
+        unsolved = False
+        while self.limit > self.options.least_step:
+            change = local.step(self.limit)
+            largest = local.largest_movement(change)
+            try:
+                self.evaluations += 1
+                trial = self.problem.trial(self.trial.coefficients + change, self.trial)
+                value = local.objective(trial, loss)
+                gain = (local.value - value) / local.decrease(change)
+            except NotConverged:
+                unsolved, gain, value = True, -1.0, np.inf
+            self.limit = _next_limit(self.limit, largest, gain)
+            if gain > 0.0:
+                self.trial = trial
+                self.trace.append(
+                    Step(trial.match.rms, value, local.noise, local.scales.force, largest, local.length, gain)
+                )
+                return None
+        self.limit = self.options.max_step
+        return Outcome.REFUSED if unsolved else Outcome.NO_DESCENT
+
+
+def _next_limit(limit: float, taken: float, gain: float) -> float:
+    if gain <= 0.0:
+        return min(limit, taken) / 3.0
+    if gain < 0.3:
+        return limit / 2.0
+    return max(limit, 2.0 * taken) if gain > 0.7 else limit
+
+
+class LocalModel:
+    """The Gauss-Newton model of the objective about a trial, at the scales found there.
+
+    Args:
+        problem: what is registered.
+        trial: where.
+        loss: of the points.
+        noise: their scale so far, metres, for the weights that the scales are found with.
+        graduation: the noise is taken as at least this part of what the linear model promises to change.
+    """
+
+    def __init__(self, problem: Problem, trial: Trial, loss: Loss, noise: float, graduation: float = 0.0) -> None:
+        self.problem, self.trial = problem, trial
+        distances = trial.match.distances
+        self.jacobian = problem.jacobian(trial)
+        weights = loss.weight(distances / noise)
+        self.scales, self.is_graduated = self._found_scales(loss, weights, graduation)
+        self.noise = self.scales.noise
+        self.weights = loss.weight(distances / self.noise)
+        self.precision = np.ones(problem.size)
+        self.precision[problem.force_part] = 1.0 / self.scales.force**2
+        self.information = self.jacobian.T @ (weights[:, None] * self.jacobian)
+        self._hessian = self.information / self.noise**2 + np.diag(self.precision)
+        self.gradient = self.jacobian.T @ (self.weights * distances) / self.noise**2
+        self.gradient += self.precision * trial.coefficients
+        self._values, self._vectors = np.linalg.eigh(self._scaled(self._hessian))
+        self.value = self.objective(trial, loss)
+
+    def _found_scales(self, loss: Loss, weights: Floats, graduation: float) -> tuple[Scales, bool]:
+        """Scales, and whether the noise is held above what the linear model alone would believe."""
+        problem = self.problem
+        jacobian, residuals = self.jacobian[:, problem.force_part], self.trial.match.distances
+        if problem.pose is not None:
+            jacobian, residuals = self._without_pose(jacobian, residuals, weights)
+        coefficients = self.trial.coefficients[problem.force_part]
+        local = linearised(jacobian, residuals, weights, coefficients, loss.consistency)
+        scales = find_scales(local, problem.noise, problem.forces.scale)
+        least = graduation * local.promised(scales, coefficients)
+        if least <= scales.noise:
+            return scales, False
+        return find_scales(local, problem.noise.at_least(least), problem.forces.scale), True
+
+    def _without_pose(self, jacobian: Floats, residuals: Floats, weights: Floats) -> tuple[Floats, Floats]:
+        """The linear problem with what a pose can explain projected out."""
+        root = np.sqrt(weights)
+        turned = np.linalg.qr(root[:, None] * self.jacobian[:, self.problem.forces.size :])[0]
+        inner, rest = root[:, None] * jacobian, root * residuals
+        inner, rest = inner - turned @ (turned.T @ inner), rest - turned @ (turned.T @ rest)
+        safe = np.maximum(root, 1e-9)
+        return inner / safe[:, None], rest / safe
+
+    def _scaled(self, matrix: Floats) -> Floats:
+        """In coefficients of unit prior variance: forces in newtons and poses differ by orders of size."""
+        root = 1.0 / np.sqrt(self.precision)
+        return root[:, None] * matrix * root
+
+    def objective(self, trial: Trial, loss: Loss) -> float:
+        """Robust distances and prior at these scales."""
+        prior = 0.5 * float(self.precision @ trial.coefficients**2)
+        return float(loss.value(trial.match.distances / self.noise).sum()) + prior
+
+    @property
+    def length(self) -> float:
+        """Length of the whole step in posterior deviations a coefficient."""
+        whole = self._solve(0.0)
+        return float(np.sqrt(max(-float(whole @ self.gradient), 0.0) / len(whole)))
+
+    def _solve(self, damping: float) -> Floats:
+        root = 1.0 / np.sqrt(self.precision)
+        rotated = self._vectors.T @ (root * self.gradient)
+        return -root * (self._vectors @ (rotated / (self._values + damping)))
+
+    def step(self, limit: float) -> Floats:
+        """The best change of the coefficients that moves no observed node further than the limit, metres."""
+        damping = 0.0
+        while True:
+            change = self._solve(damping)
+            if self.largest_movement(change) <= 1.05 * limit:
+                return change
+            damping = max(1.6 * damping, 1e-8 * self._values[-1], 0.1)
+
+    def decrease(self, change: Floats) -> float:
+        """Decrease of the objective that the model predicts."""
+        return -float(self.gradient @ change + 0.5 * change @ self._hessian @ change)
+
+    def largest_movement(self, change: Floats) -> float:
+        """Largest predicted movement of an observed node, metres."""
+        return float(self.problem.moved(self.trial, change).max())
+
+    def posterior(self) -> Posterior:
+        """Laplace's approximation at the trial."""
+        return posterior(self.information, self.precision, self.trial.coefficients, self.scales)

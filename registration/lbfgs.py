@@ -1,0 +1,119 @@
+"""L-BFGS with the gradient by the adjoint: no derivatives of single coefficients are needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from softtwin.reference.outcome import NotConverged
+
+from .evidence import Scales
+from .gauss_newton import Found, LocalModel, Step
+from .loss import Huber, Loss, Tukey, robust_deviation
+from .outcome import Outcome
+from .problem import Problem, Trial
+
+Floats = NDArray[np.float64]
+_WALL = 10.0  # times the objective: what a coefficient costs at which the model finds no state
+
+
+@dataclass(frozen=True)
+class LBFGS:
+    """SciPy's L-BFGS on the robust loss with the adjoint's gradient (Odot 2023, eq. 6.10).
+
+    The scales of noise and forces are found between the runs, from one linearisation each.
+
+    Args:
+        losses: one run for each.
+        max_iterations: of one run.
+        memory: pairs that the Hessian is built from.
+        tolerance: relative fall of the objective below which a run ends.
+    """
+
+    losses: tuple[Loss, ...] = (Huber(), Huber(), Tukey())
+    max_iterations: int = 200
+    memory: int = 30
+    tolerance: float = 1e-9
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1 or self.memory < 1:
+            raise ValueError(
+                f"LBFGS.max_iterations, LBFGS.memory: expected at least 1, got {self.max_iterations} and {self.memory}."
+            )
+
+    def rough(self) -> LBFGS:
+        """The same with the first loss alone: for a start."""
+        return replace(self, losses=self.losses[:1])
+
+    def solve(self, problem: Problem, start: Floats, near: Trial | None = None) -> Found:
+        """The coefficients that minimise the robust distance plus the prior.
+
+        Args:
+            problem: what is registered.
+            start: coefficients to start from, (k,).
+            near: a trial whose state is near the start's.
+
+        Raises:
+            NotConverged: the model found no state at the start.
+        """
+        return _Run(self, problem, start, near).found()
+
+
+class _Run:
+    def __init__(self, options: LBFGS, problem: Problem, start: Floats, near: Trial | None) -> None:
+        self.options, self.problem = options, problem
+        self.trial = self.best = problem.trial(start, near, anew=True)
+        self.evaluations, self.trace = 1, list[Step]()
+
+    def found(self) -> Found:
+        noise = max(robust_deviation(self.trial.match.distances), self.problem.noise.least)
+        outcome = Outcome.CONVERGED
+        for loss in self.options.losses:
+            local = LocalModel(self.problem, self.trial, loss, noise)
+            noise = local.noise
+            outcome = self._descend(loss, local.scales, noise)
+        local = LocalModel(self.problem, self.trial, self.options.losses[-1], noise)
+        return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
+
+    def _descend(self, loss: Loss, scales: Scales, noise: float) -> Outcome:
+        """One run at fixed scales, in coefficients of unit prior variance."""
+        problem = self.problem
+        root = np.ones(problem.size)
+        root[problem.force_part] = scales.force
+        least = np.inf
+        met_wall = False
+
+        def evaluate(scaled: Floats) -> tuple[float, Floats]:
+            nonlocal least, met_wall
+            self.evaluations += 1
+            try:
+                trial = problem.trial(root * scaled, self.trial, anew=True)
+            except NotConverged:  # a wall that the line search steps back from
+                met_wall = True
+                return _WALL * max(least, 1.0), np.zeros_like(scaled)
+            value, gradient = _objective(problem, trial, loss, noise)
+            value += 0.5 * float(scaled @ scaled)
+            if value < least:
+                least, self.best = value, trial
+            return value, root * gradient + scaled
+
+        limits = {"maxiter": self.options.max_iterations, "ftol": self.options.tolerance, "maxcor": self.options.memory}
+        done = minimize(evaluate, self.trial.coefficients / root, jac=True, method="L-BFGS-B", options=limits)
+        moved = float(problem.moved(self.trial, self.best.coefficients - self.trial.coefficients).max())
+        self.trial = self.best
+        self.trace.append(Step(self.trial.match.rms, least, noise, scales.force, moved, float("nan"), float("nan")))
+        if done.success:
+            return Outcome.CONVERGED
+        if done.status == 1:
+            return Outcome.MOST_ITERATIONS
+        return Outcome.REFUSED if met_wall else Outcome.NO_DESCENT
+
+
+def _objective(problem: Problem, trial: Trial, loss: Loss, noise: float) -> tuple[float, Floats]:
+    """Robust distances and their gradient by the coefficients, (k,)."""
+    scaled = trial.match.distances / noise
+    slope = loss.weight(scaled) * scaled / noise
+    return float(loss.value(scaled).sum()), problem.pulled(trial, slope)

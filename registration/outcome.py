@@ -1,0 +1,32 @@
+"""How a registration ended, and what to try."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Outcome(Enum):
+    """How a solver stopped; only `CONVERGED` is a success."""
+
+    CONVERGED = "converged"
+    NO_DESCENT = "no step lowers the objective"
+    REFUSED = "the model finds no state further on"
+    MOST_ITERATIONS = "most iterations reached"
+
+    @property
+    def is_success(self) -> bool:
+        """True for convergence alone."""
+        return self is Outcome.CONVERGED
+
+    @property
+    def advice(self) -> str:
+        """What to try."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Outcome.CONVERGED: "nothing: a further step would move less than a fifth of what is uncertain.",
+    Outcome.NO_DESCENT: "start from another frame's result or a better pose; look whether cloud and organ match.",
+    Outcome.REFUSED: "the forces that the cloud asks for leave what the model can solve: check pose and stiffness.",
+    Outcome.MOST_ITERATIONS: "raise max_iterations, or start from the result of this frame.",
+}

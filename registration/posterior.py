@@ -1,0 +1,50 @@
+"""What is known of the coefficients after the cloud: Laplace's approximation at a state, in its own eigenvectors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .evidence import Scales
+from .unknowns import Forces
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """A normal law of the coefficients.
+
+    Args:
+        mean: (k,).
+        covariance: (k, k).
+        scales: noise and force scale that it was taken with.
+        informed: directions that the cloud tells more of than the prior did (the sum of their shares).
+    """
+
+    mean: Floats
+    covariance: Floats
+    scales: Scales
+    informed: float
+
+    def net_force_covariance(self, forces: Forces) -> Floats:
+        """Covariance of the net force, (3, 3), newtons^2, with the prior's share of what was left out."""
+        net = forces.net_basis
+        inner = self.covariance[: forces.size, : forces.size]
+        return net @ inner @ net.T + self.scales.force**2 * forces.left_out
+
+
+def posterior(information: Floats, precision: Floats, mean: Floats, scales: Scales) -> Posterior:
+    """The posterior for the information J^T W J of unit noise, (k, k), and the prior's precision, (k,).
+
+    Args:
+        information: of the points, 1/m^2 per squared unit of the coefficients.
+        precision: of the prior, (k,).
+        mean: the coefficients found, (k,).
+        scales: noise and force scale.
+    """
+    seen = information / scales.noise**2
+    covariance = np.linalg.inv(seen + np.diag(precision))
+    return Posterior(mean, covariance, scales, float(np.einsum("ij,ji->", covariance, seen)))

@@ -1,0 +1,339 @@
+"""Clouds to states of one body: prepared once, then frame after frame, each from what the last one found."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.clouds import check_cloud
+from softtwin.meshes.metrics import edge_lengths
+
+from .evidence import Scale
+from .forward import ForwardModel, ReducedModel, State, reduce_model
+from .gauss_newton import Found, GaussNewton, Step
+from .lbfgs import LBFGS
+from .outcome import Outcome
+from .pose import Pose
+from .problem import Problem, Trial
+from .residuals import SurfaceDistance
+from .thinning import thinned
+from .unknowns import Forces, Informed, PosePrior, contact, informed, nodal_forces, windowed
+from .verdict import Expectations, Judgement, judge
+
+Floats = NDArray[np.float64]
+# Of the logarithm of a nodal force. A model with an error of its own must not explain that by forces.
+EXACT_SPREAD, LEARNED_SPREAD = 1.0, 0.5
+_LEFT = 1.5  # times the noise of the frame before
+_LEADING = 6  # directions of force that a cold start begins with
+NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
+
+
+@dataclass(frozen=True)
+class RegistrationOptions:
+    """How a cloud is trusted and by what it is registered.
+
+    Args:
+        noise: what is believed of the standard deviation of a point's distance, metres; found from the cloud.
+        solver: how the objective is minimised.
+        most_points: larger clouds are thinned to so many points.
+        rounds: how often a cold start gathers the forces where it found some.
+        reach: forces within this part of the body's size are gathered together.
+        informed: which directions are kept of gathered forces.
+    """
+
+    noise: Scale = NOISE
+    solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
+    most_points: int = 1000
+    rounds: int = 2
+    reach: float = 0.035
+    informed: Informed = field(default_factory=Informed)
+
+    def __post_init__(self) -> None:
+        if self.most_points < 1:
+            raise ValueError(f"RegistrationOptions.most_points: expected at least 1, got {self.most_points}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Forces and the reduced model between them and the observed side.
+
+    Args:
+        forces: the unknown forces.
+        model: from their coefficients to the observed nodes.
+    """
+
+    forces: Forces
+    model: ReducedModel
+
+    @classmethod
+    def of(cls, model: ForwardModel, observed: SurfaceDistance, forces: Forces) -> Prepared:
+        """What can be multiplied before a cloud comes."""
+        return cls(forces, reduce_model(model, observed.nodes, forces.basis))
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """One registered cloud.
+
+    Args:
+        prepared: the forces' basis that its coefficients belong to.
+        trial: where the solver ended; the next frame starts there.
+        forces: nodal forces, (n, 3), newtons.
+        state: the body's state, with its derivatives.
+        pose: from the body's coordinates to the cloud's.
+        net_force: (3,), newtons.
+        net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
+        noise: standard deviation of a point's distance that was found, metres.
+        force_scale: standard deviation of the force coefficients that was found, newtons.
+        rms_distance: of the cloud to the registered surface, metres.
+        outliers: share of the points that pulled nothing.
+        informed: directions of force and pose that the cloud told.
+        points: points that were used, after thinning.
+        outcome: how the solver ended.
+        judgement: whether the result can be used, and why not.
+        evaluations: forward solves.
+        seconds: wall time.
+        trace: one entry an iteration.
+    """
+
+    prepared: Prepared
+    trial: Trial
+    forces: Floats
+    state: State
+    pose: Pose
+    net_force: Floats
+    net_force_covariance: Floats
+    noise: float
+    force_scale: float
+    rms_distance: float
+    outliers: float
+    informed: float
+    points: int
+    outcome: Outcome
+    judgement: Judgement
+    evaluations: int
+    seconds: float
+    trace: tuple[Step, ...]
+
+    @property
+    def coefficients(self) -> Floats:
+        """Of forces and pose, (k,)."""
+        return self.trial.coefficients
+
+    @property
+    def displacement(self) -> Floats:
+        """Of all nodes, (n, 3), metres, in the body's coordinates."""
+        return self.state.displacement
+
+    @property
+    def net_force_deviation(self) -> Floats:
+        """Standard deviation of each component of the net force, (3,), newtons."""
+        return np.sqrt(np.diag(self.net_force_covariance))
+
+
+class Registrar:
+    """Registers clouds to one body with one model; what does not depend on the cloud is prepared once.
+
+    Args:
+        model: forward model.
+        observed: the observed side.
+        forces: the unknown forces.
+        options: noise, solver, thinning, search for the place of the forces.
+        pose: prior of the pose; None for clouds in the body's coordinates.
+        expectations: what a usable result looks like; by the body's size and the noise if not given.
+    """
+
+    def __init__(
+        self,
+        model: ForwardModel,
+        observed: SurfaceDistance,
+        forces: Forces,
+        options: RegistrationOptions | None = None,
+        *,
+        pose: PosePrior | None = None,
+        expectations: Expectations | None = None,
+    ) -> None:
+        self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
+        self.options = options or RegistrationOptions()
+        self.noise = self.options.noise.at_least(model.error)  # points tell no more than the model can meet
+        self.expectations = expectations or Expectations.of(model, self.noise)
+        self._everywhere = Prepared.of(model, observed, forces)
+        self._leading = Prepared.of(model, observed, forces.leading(_LEADING))
+
+    def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
+        """The forces, the state and the pose that bring the observed side to a cloud.
+
+        Args:
+            cloud: observed points, (p, 3), metres.
+            start: an earlier frame's result to start from; no force if not given.
+
+        Raises:
+            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+            NotConverged: the model found no state at the start.
+        """
+        begin = time.perf_counter()
+        points = self._checked(cloud)
+        if start is None:
+            return self._cold(points, begin)
+        problem = self._problem(points, start.prepared)
+        found = self.options.solver.solve(problem, start.coefficients, start.trial)
+        result = self._result(problem, found, start.prepared, begin)
+        if self.options.rounds and self._has_left(result, start):
+            return self._cold(points, begin)
+        return result
+
+    def _problem(self, points: Floats, prepared: Prepared) -> Problem:
+        return Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.noise)
+
+    def _cold(self, points: Floats, begin: float) -> Registration:
+        """From rest; where the place of the forces is unknown, once more from rest for each round of gathering them."""
+        prepared = self._everywhere
+        found = self._from_rest(points, prepared, self._leading)
+        for _ in range(self.options.rounds):
+            inner = found.trial.coefficients[: prepared.forces.size]
+            prepared = self._gathered(prepared.forces.forces(inner))
+            spent, found = found, self._from_rest(points, prepared)
+            found = _after(spent, found)
+        return self._result(self._problem(points, prepared), found, prepared, begin)
+
+    def _from_rest(self, points: Floats, prepared: Prepared, leading: Prepared | None = None) -> Found:
+        """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
+        problem, solver = self._problem(points, prepared), self.options.solver
+        start = np.zeros(problem.size)
+        if prepared.forces.size <= _LEADING:
+            return solver.solve(problem, start)
+        first = leading or Prepared.of(self.model, self.observed, prepared.forces.leading(_LEADING))
+        rough = self._problem(points, first)
+        begun = solver.rough().solve(rough, np.zeros(rough.size))
+        start[:_LEADING] = begun.trial.coefficients[:_LEADING]
+        start[prepared.forces.size :] = begun.trial.coefficients[_LEADING:]
+        return _after(begun, solver.solve(problem, start, begun.trial))
+
+    def _gathered(self, nodal: Floats) -> Prepared:
+        """The unknown forces once more, where forces were found."""
+        body = self.model.body
+        where = contact(self.forces, nodal, body.points, self.options.reach * body.size)
+        forces = informed(windowed(self.forces, where), self.model, self.observed, self.options.informed)
+        return Prepared.of(self.model, self.observed, forces)
+
+    def _has_left(self, result: Registration, start: Registration) -> bool:
+        """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
+        return result.noise > _LEFT * max(start.noise, self.noise.least)
+
+    def _checked(self, cloud: ArrayLike) -> Floats:
+        points = np.asarray(cloud, dtype=np.float64)
+        if points.ndim == 2 and points.shape[1:] == (3,):
+            finite: Any = np.isfinite(points).all()
+            points = points[thinned(points, self.options.most_points)] if finite else points
+        if self.pose is not None and points.ndim == 2 and points.shape[1:] == (3,):
+            check_cloud(self.pose.mean.inverse().apply(points), self.model.body)
+            return points
+        return check_cloud(points, self.model.body)
+
+    def _result(self, problem: Problem, found: Found, prepared: Prepared, begin: float) -> Registration:
+        trial, forces = found.trial, prepared.forces
+        inner = trial.coefficients[problem.force_part]
+        nodal = forces.forces(inner)
+        state = trial.state.full
+        return Registration(
+            prepared=prepared,
+            trial=trial,
+            forces=nodal,
+            state=state,
+            pose=trial.pose or Pose.identity(),
+            net_force=nodal.sum(axis=0),
+            net_force_covariance=found.posterior.net_force_covariance(forces),
+            noise=found.posterior.scales.noise,
+            force_scale=found.posterior.scales.force,
+            rms_distance=trial.match.rms,
+            outliers=float(np.mean(found.weights < 0.05)),
+            informed=found.posterior.informed,
+            points=len(problem.cloud),
+            outcome=found.outcome,
+            judgement=judge(problem, found, state, self.expectations),
+            evaluations=found.evaluations,
+            seconds=time.perf_counter() - begin,
+            trace=found.trace,
+        )
+
+
+def prepare(
+    model: ForwardModel,
+    nodes: ArrayLike,
+    triangles: ArrayLike | None = None,
+    *,
+    force_scale: float,
+    smoothness: float = 0.02,
+    directions: int = 64,
+    options: RegistrationOptions | None = None,
+    pose: PosePrior | None = None,
+) -> Registrar:
+    """A registrar with forces at the nodes that may carry some, reduced to what a cloud can tell.
+
+    Args:
+        model: forward model.
+        nodes: nodes that may carry force.
+        triangles: the observed side, (t, 3); the whole boundary if not given.
+        force_scale: size of a nodal force to begin with, newtons; see `expected_force`.
+        smoothness: correlation length of neighbouring forces, metres; 0 for none.
+        directions: most directions of force kept.
+        options: noise, solver, thinning, rounds.
+        pose: prior of the pose; None for clouds in the body's coordinates.
+
+    Raises:
+        ValueError: no node is left on the free boundary.
+    """
+    options = options or RegistrationOptions()
+    observed = SurfaceDistance(model.body, triangles)
+    spread = LEARNED_SPREAD if model.error > 0.0 else EXACT_SPREAD
+    scale = Scale(force_scale, spread, least=1e-2 * force_scale)
+    every = nodal_forces(model.body, nodes, scale, smoothness)
+    rule = Informed(options.noise.least, scale=10.0 * force_scale, most=directions)
+    return Registrar(model, observed, informed(every, model, observed, rule), options, pose=pose)
+
+
+def rounds_for(model: ForwardModel, has_zone: bool) -> int:
+    """How often a cold start gathers the forces: not where an exact model is told their place, and solves are dear.
+
+    Args:
+        model: forward model.
+        has_zone: the nodes that may carry force are those that a tool can touch.
+    """
+    return 0 if has_zone and model.error == 0.0 else 2
+
+
+def expected_force(body: Body, young_modulus: float) -> float:
+    """Nodal force to begin with, newtons: 1 % of Young's modulus (Pa) over the square of a typical edge."""
+    edge = float(np.median(edge_lengths(body.points, body.cells)))
+    return 0.01 * young_modulus * edge**2
+
+
+def _after(first: Found, second: Found) -> Found:
+    """The second result, with what the first took."""
+    return replace(second, evaluations=first.evaluations + second.evaluations, trace=(*first.trace, *second.trace))
+
+
+def register_sequence(registrar: Registrar, clouds: Iterable[ArrayLike]) -> Iterator[Registration]:
+    """Register clouds in their order, as they come; the caller may stop between any two.
+
+    A frame starts from the last one that was not refused.
+
+    Args:
+        registrar: model, observed side, unknowns and options.
+        clouds: one cloud a frame, (p, 3), metres.
+
+    Raises:
+        CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+    """
+    last = None
+    for cloud in clouds:
+        result = registrar.register(cloud, last)
+        if result.judgement.is_usable:
+            last = result
+        yield result

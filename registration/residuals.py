@@ -1,0 +1,105 @@
+"""How far a deformed surface is from an observed cloud, one-sided, with its exact derivative."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.closest import ClosestPoints
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A cloud matched to a deformed surface.
+
+    Args:
+        distances: signed along the directions, (p,), metres: positive where the surface is beyond the point.
+        directions: unit vectors in which each distance grows, (p, 3).
+        triangles: triangle that holds each closest point, (p,).
+        weights: barycentric weights of the closest points, (p, 3).
+    """
+
+    distances: Floats
+    directions: Floats
+    triangles: Ints
+    weights: Floats
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the distances, metres."""
+        return float(np.sqrt(np.mean(self.distances**2)))
+
+
+class SurfaceDistance:
+    """Distances from a cloud to the observed side of a body: what is not seen pulls nothing.
+
+    Args:
+        body: the body.
+        triangles: the observed side as node numbers, (t, 3); the whole boundary if not given.
+    """
+
+    def __init__(self, body: Body, triangles: ArrayLike | None = None) -> None:
+        self.body = body
+        chosen = body.boundary if triangles is None else np.asarray(triangles, dtype=np.int64)
+        self.nodes, local = np.unique(chosen, return_inverse=True)
+        self.triangles = local.reshape(-1, 3)
+        self.rest: Floats = body.points[self.nodes]
+        self._closest = ClosestPoints(self.triangles, len(self.nodes))
+
+    def match(self, displacement: Floats, cloud: Floats, near: Match | None = None) -> Match:
+        """A cloud (p, 3) matched to the surface moved by the displacement (m, 3) of the nodes `nodes`, metres.
+
+        Args:
+            displacement: of the nodes `nodes`, (m, 3), metres.
+            cloud: points, (p, 3), metres.
+            near: a match of the same cloud to walk from, faster; the search starts anew if not given.
+        """
+        positions = self.rest + displacement
+        if near is None:
+            triangles, weights = self._closest.find(positions, cloud)
+        else:
+            triangles, weights = self._closest.follow(positions, cloud, near.triangles)
+        corners = positions[self.triangles[triangles]]
+        offsets = np.einsum("pk,pki->pi", weights, corners) - cloud
+        lengths = np.sqrt(np.einsum("pi,pi->p", offsets, offsets))
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.sqrt(np.einsum("pi,pi->p", normals, normals))[:, None]
+        # On the surface itself the offset has no direction: the normal is its limit.
+        on_it = lengths < 1e-12 * self.body.size
+        directions = np.where(on_it[:, None], normals, offsets / np.where(on_it, 1.0, lengths)[:, None])
+        side = np.where(np.einsum("pi,pi->p", directions, normals) < 0.0, -1.0, 1.0)
+        return Match(side * lengths, side[:, None] * directions, triangles, weights)
+
+    def feet(self, match: Match) -> Floats:
+        """The closest points of a match on the surface at rest, (p, 3), metres."""
+        found: Floats = np.einsum("pk,pki->pi", match.weights, self.rest[self.triangles[match.triangles]])
+        return found
+
+    def rows(self, match: Match) -> csr_array:
+        """Derivative of the distances with respect to the displacement of the observed nodes, (p, 3m).
+
+        Exact: by the envelope theorem the closest point may be held fixed on its triangle.
+        """
+        count = len(match.distances)
+        columns = (3 * self.triangles[match.triangles][:, :, None] + np.arange(3)).reshape(count, 9)
+        values = (match.weights[:, :, None] * match.directions[:, None, :]).reshape(count, 9)
+        indptr = np.arange(0, 9 * count + 1, 9)
+        return csr_array((values.ravel(), columns.ravel(), indptr), shape=(count, 3 * len(self.nodes)))
+
+    def normals(self) -> tuple[Floats, Floats]:
+        """Normal, (m, 3), and share of the observed side's area, (m,), of each observed node at rest."""
+        corners = self.rest[self.triangles]
+        areas = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        sums, share = np.zeros_like(self.rest), np.zeros(len(self.rest))
+        for corner in range(3):
+            np.add.at(sums, self.triangles[:, corner], areas)
+            np.add.at(share, self.triangles[:, corner], np.linalg.norm(areas, axis=1) / 3.0)
+        lengths = np.maximum(np.linalg.norm(sums, axis=1), 1e-300)
+        return sums / lengths[:, None], share / share.sum()

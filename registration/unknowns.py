@@ -1,0 +1,227 @@
+"""The unknowns of a registration, in blocks with priors: nodal forces through few directions, and the pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.spatial import cKDTree
+
+from softtwin.meshes.body import Body
+
+from .evidence import Scale
+from .forward import ForwardModel, reduce_model
+from .pose import Pose
+from .residuals import SurfaceDistance
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+_SMALLEST_VARIANCE = 1e-5  # of a pattern of forces, relative to the largest: rougher ones are left out
+_TANGENTIAL = 0.5  # weight of movements along the observed side: they become normal where it turns
+FORCE = Scale(0.01, 2.0, least=1e-5)
+
+
+@dataclass(frozen=True, eq=False)
+class Forces:
+    """Nodal forces as a linear function of coefficients, independent and of one scale beforehand.
+
+    Args:
+        nodes: nodes that may carry force, (a,).
+        basis: nodal forces of each coefficient, (3n, k), dimensionless: coefficients are in newtons.
+        scale: what is believed of the coefficients' standard deviation, newtons.
+        left_out: covariance of the net force of directions that were left out, for unit scale, (3, 3).
+        every: the basis before any direction was left out, (3n, m).
+        where: part of its expected size that a force at each node may have, (n,); None for the whole of it.
+    """
+
+    nodes: Ints
+    basis: Floats
+    scale: Scale = FORCE
+    left_out: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+    every: Floats | None = None
+    where: Floats | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients, k."""
+        return self.basis.shape[1]
+
+    @property
+    def directions(self) -> int:
+        """How many directions there were before any was left out."""
+        return self.size if self.every is None else self.every.shape[1]
+
+    def forces(self, coefficients: Floats) -> Floats:
+        """Nodal forces, (n, 3), newtons."""
+        return (self.basis @ coefficients).reshape(-1, 3)
+
+    def leading(self, count: int) -> Forces:
+        """The first directions alone: those that move the observed side most, where they were reduced."""
+        return replace(self, basis=self.basis[:, :count])
+
+    @property
+    def net_basis(self) -> Floats:
+        """Net force of each coefficient, (3, k)."""
+        return self.basis.reshape(-1, 3, self.size).sum(axis=0)
+
+
+def nodal_forces(body: Body, nodes: ArrayLike, scale: Scale = FORCE, smoothness: float = 0.0) -> Forces:
+    """Three force components at every node of a zone.
+
+    With a smoothness length s, the forces of two nodes at distance d correlate by exp(-d^2 / 2 s^2), so that a smooth
+    pull is cheaper than a scattered one.
+
+    Args:
+        body: the body.
+        nodes: nodes that may carry force; fixed and inner ones are left out.
+        scale: expected size of a nodal force component, newtons, and how well it is known.
+        smoothness: correlation length, metres; 0 for independent nodes (the L2 penalty of Odot 2023, eq. 6.5, squared).
+
+    Raises:
+        ValueError: no node is left, or a smoothness that is negative.
+    """
+    if not 0.0 <= smoothness < np.inf:
+        raise ValueError(f"nodal_forces.smoothness: expected a length of 0 m or more, got {smoothness}.")
+    chosen = np.setdiff1d(np.intersect1d(np.asarray(nodes, dtype=np.int64), body.boundary_nodes), body.fixed)
+    if len(chosen) == 0:
+        raise ValueError(
+            f"nodal_forces.nodes: expected nodes on the free boundary, none of the {np.size(nodes)} given is; "
+            "give the zone that the tool may touch."
+        )
+    root = _correlation_root(body.points[chosen], smoothness)
+    basis = np.zeros((len(body.points), 3, 3 * root.shape[1]))
+    for axis in range(3):
+        basis[chosen, axis, axis::3] = root
+    return Forces(chosen, basis.reshape(-1, 3 * root.shape[1]), scale)
+
+
+def _correlation_root(positions: Floats, smoothness: float) -> Floats:
+    """Independent patterns of nodal forces, (a, m), whose covariance is the correlation; few where it is smooth."""
+    if smoothness <= 0.0:
+        return np.eye(len(positions))
+    squared = ((positions[:, None] - positions[None]) ** 2).sum(axis=2)
+    correlation = np.exp(-squared / (2.0 * smoothness**2))
+    variances, modes = np.linalg.eigh(correlation)
+    kept = variances > _SMALLEST_VARIANCE * variances[-1]
+    return modes[:, kept] * np.sqrt(variances[kept])
+
+
+@dataclass(frozen=True)
+class Informed:
+    """Which directions of force a cloud can tell: those that move the observed side by more than the noise.
+
+    Args:
+        noise: least noise of a point expected, metres.
+        points: number of points of a cloud expected.
+        scale: largest scale of the coefficients expected, newtons.
+        information: directions whose expected information, in units of the prior's, is below this are left out.
+        most: most directions kept.
+    """
+
+    noise: float = 1e-4
+    points: int = 500
+    scale: float = 0.03
+    information: float = 0.5
+    most: int = 96
+
+
+def informed(forces: Forces, model: ForwardModel, observed: SurfaceDistance, rule: Informed | None = None) -> Forces:
+    """The forces reduced to the directions that a cloud of the observed side can tell at rest.
+
+    They are the leading eigenvectors of the prior-whitened Gauss-Newton matrix at rest: the likelihood-informed
+    subspace (Spantini et al. 2015). What is left out keeps its prior variance in the net force.
+
+    Args:
+        forces: the forces.
+        model: forward model, for its tangent at rest.
+        observed: the observed side.
+        rule: what is told from what.
+    """
+    rule = rule or Informed()
+    state = reduce_model(model, observed.nodes, forces.basis).solve(np.zeros(forces.size))
+    moved = state.jacobian(_observing_rows(observed))
+    squares, vectors = np.linalg.eigh(moved.T @ moved)
+    information = squares[::-1] * (rule.scale / rule.noise) ** 2 * rule.points
+    kept = vectors[:, ::-1][:, : min(rule.most, max(int((information > rule.information).sum()), 1))]
+    net = forces.net_basis
+    rest = net - (net @ kept) @ kept.T
+    every = forces.basis if forces.every is None else forces.every
+    return replace(forces, basis=forces.basis @ kept, left_out=forces.left_out + rest @ rest.T, every=every)
+
+
+def windowed(forces: Forces, where: Floats) -> Forces:
+    """The forces where they may act: each node's share of the basis times its part.
+
+    Args:
+        forces: forces of which nothing is known of their place.
+        where: part of its expected size that a force at each node may have, (n,).
+    """
+    rows = np.repeat(where, 3)[:, None]
+    every = rows * (forces.basis if forces.every is None else forces.every)
+    basis = rows * forces.basis
+    whole, kept = (columns.reshape(-1, 3, columns.shape[1]).sum(axis=0) for columns in (every, basis))
+    return replace(forces, basis=basis, left_out=whole @ whole.T - kept @ kept.T, every=every, where=where)
+
+
+def contact(forces: Forces, nodal: Floats, positions: Floats, reach: float, least: float = 0.02) -> Floats:
+    """Where forces were found, as parts of the largest, (n,): the next prior of forces whose place is unknown.
+
+    Repeated, forces gather where the cloud asks for them (re-weighted least squares: Gorodnitsky and Rao 1997).
+
+    Args:
+        forces: the unknown forces.
+        nodal: forces found, (n, 3), newtons.
+        positions: of the nodes at rest, (n, 3), metres.
+        reach: forces within this distance count together, metres.
+        least: no part is smaller: a force elsewhere stays possible.
+    """
+    place = positions[forces.nodes]
+    size = np.linalg.norm(nodal[forces.nodes], axis=1)
+    near = cKDTree(place).sparse_distance_matrix(cKDTree(place), 3.0 * reach, output_type="coo_matrix")
+    smooth = coo_array((np.exp(-0.5 * (near.data / reach) ** 2), (near.row, near.col)), shape=near.shape) @ size
+    where = np.zeros(len(positions))
+    where[forces.nodes] = np.maximum(smooth / max(smooth.max(), 1e-300), least)
+    return where
+
+
+def _observing_rows(observed: SurfaceDistance) -> csr_array:
+    """Root mean square movement of the observed side as rows, (3m, 3m): along the normal, and less across it."""
+    normals, share = observed.normals()
+    count = len(normals)
+    blocks = _TANGENTIAL * np.eye(3) + (1.0 - _TANGENTIAL) * normals[:, :, None] * normals[:, None, :]
+    blocks *= np.sqrt(share)[:, None, None]
+    columns = np.repeat((3 * np.arange(count)[:, None] + np.arange(3))[:, None, :], 3, axis=1)
+    return csr_array((blocks.ravel(), columns.ravel(), np.arange(0, 9 * count + 1, 3)), shape=(3 * count, 3 * count))
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """An unknown pose near an expected one.
+
+    Args:
+        mean: the pose expected.
+        centre: of the turn, in the body's coordinates, (3,), metres.
+        turn: standard deviation of the turn about each axis, radians.
+        shift: standard deviation of the shift along each axis, metres.
+    """
+
+    mean: Pose
+    centre: Floats
+    turn: float = np.deg2rad(5.0)
+    shift: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name in ("turn", "shift"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f"PosePrior.{name}: expected a positive deviation, got {getattr(self, name)}.")
+
+    @property
+    def deviations(self) -> Floats:
+        """Of turn and shift, (6,)."""
+        return np.repeat([self.turn, self.shift], 3)
+
+    def pose(self, coefficients: Floats) -> Pose:
+        """The pose for coefficients of unit variance, (6,)."""
+        return self.mean.moved(self.deviations * coefficients, self.mean.apply(self.centre[None])[0])

@@ -1,0 +1,200 @@
+"""Whether a registration can be used: accepted, doubtful or refused, each with its reasons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .evidence import Scale
+from .forward import ForwardModel, State
+from .gauss_newton import Found
+from .outcome import Outcome
+from .problem import Problem
+
+Floats = NDArray[np.float64]
+_NEIGHBOURS = 6
+_FEWEST_POINTS = 30
+
+
+class Verdict(Enum):
+    """What a result may be used for."""
+
+    ACCEPTED = "accepted"
+    DOUBTFUL = "doubtful"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict with its reasons.
+
+    Args:
+        verdict: the worst of what was found.
+        reasons: one sentence each; none where it is accepted.
+    """
+
+    verdict: Verdict
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def is_usable(self) -> bool:
+        """True unless it is refused."""
+        return self.verdict is not Verdict.REFUSED
+
+
+@dataclass(frozen=True)
+class Expectations:
+    """What a usable result looks like.
+
+    Args:
+        noise: largest standard deviation of a point's distance, metres: beyond it organ and cloud do not match.
+        systematic: largest part of it that neighbouring points share, metres: noise is shared by none.
+        movement: largest displacement of a node, metres; nothing is known of larger ones.
+        outliers: largest share of points that may be wrong.
+        extent: largest load relative to what the model has learned.
+        informed: fewest directions that a cloud must tell.
+        pose: largest move of the pose in deviations of its prior.
+    """
+
+    noise: float
+    systematic: float
+    movement: float
+    outliers: float = 0.4
+    extent: float = 1.2
+    informed: float = 2.0
+    pose: float = 3.0
+
+    @classmethod
+    def of(cls, model: ForwardModel, noise: Scale) -> Expectations:
+        """By the size of the model's body and the noise that is expected.
+
+        Args:
+            model: the forward model.
+            noise: what is believed of the noise beforehand.
+        """
+        size = model.body.size
+        return cls(
+            noise=max(0.025 * size, 3.0 * noise.median),
+            systematic=max(0.005 * size, noise.median),
+            movement=0.35 * size,
+        )
+
+
+_Finding = tuple[Verdict, str]
+
+
+def judge(problem: Problem, found: Found, state: State, expected: Expectations) -> Judgement:
+    """The verdict on a solver's result.
+
+    Args:
+        problem: what was registered.
+        found: where the solver ended.
+        state: the body's state there.
+        expected: what a usable result looks like.
+    """
+    findings = [
+        *_of_the_search(found),
+        *_of_the_cloud(problem, found, expected),
+        *_of_the_fit(problem, found, expected),
+        *_of_the_state(state, expected),
+        *_of_the_pose(problem, found, expected),
+    ]
+    if not findings:
+        return Judgement(Verdict.ACCEPTED)
+    findings.sort(key=lambda finding: finding[0] is not Verdict.REFUSED)  # the gravest reasons first
+    return Judgement(findings[0][0], tuple(reason for _, reason in findings))
+
+
+def _of_the_search(found: Found) -> list[_Finding]:
+    if found.outcome is Outcome.CONVERGED:
+        return []
+    return [(Verdict.DOUBTFUL, f"not converged: {found.outcome.value}; {found.outcome.advice}")]
+
+
+def _of_the_cloud(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
+    cloud, findings = problem.cloud, []
+    spread = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False) / np.sqrt(len(cloud))
+    if len(cloud) < _FEWEST_POINTS:
+        findings.append(
+            (Verdict.DOUBTFUL, f"the cloud has {len(cloud)} points; fewer than {_FEWEST_POINTS} tell little")
+        )
+    if len(cloud) < 3 or spread[1] < 0.02 * spread[0]:
+        findings.append((Verdict.REFUSED, "the cloud is a line or a spot: it shows no surface"))
+    if found.posterior.informed < expected.informed:
+        findings.append(
+            (Verdict.DOUBTFUL, f"the cloud tells {found.posterior.informed:.1f} directions of force: hardly anything")
+        )
+    return findings
+
+
+def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
+    noise, findings = found.posterior.scales.noise, []
+    if noise > expected.noise:
+        verdict = Verdict.REFUSED if noise > 1.5 * expected.noise else Verdict.DOUBTFUL
+        findings.append(
+            (verdict, f"organ and cloud do not match: points lie {1e3 * noise:.1f} mm from the surface "
+                      f"(up to {1e3 * expected.noise:.1f} mm could be noise)")
+        )  # fmt: skip
+    match = found.trial.match
+    systematic = noise * np.sqrt(shared(problem.observed.feet(match), match.distances, found.weights))
+    if systematic > expected.systematic:
+        verdict = Verdict.REFUSED if systematic > 2.0 * expected.systematic else Verdict.DOUBTFUL
+        findings.append(
+            (verdict, f"organ and cloud do not match: whole patches of the surface are {1e3 * systematic:.1f} mm off, "
+                      f"which no noise explains (up to {1e3 * expected.systematic:.1f} mm is let pass)")
+        )  # fmt: skip
+    outliers = float(np.mean(found.weights < 0.05))
+    if outliers > expected.outliers:
+        findings.append((Verdict.DOUBTFUL, f"{100 * outliers:.0f} % of the points fit nowhere"))
+    return findings
+
+
+def shared(feet: Floats, distances: Floats, weights: Floats) -> float:
+    """Part of the variance of the distances that a point shares with its neighbours, between 0 and 1.
+
+    Args:
+        feet: places of the points on the surface at rest, (p, 3), metres; in space, noise sorts points by sign.
+        distances: signed, (p,), metres.
+        weights: of the points, (p,); those without weight are left out.
+    """
+    kept = weights > 0.05
+    points, values = feet[kept], distances[kept]
+    count = min(_NEIGHBOURS, len(points) - 1)
+    if count < 1 or not values.any():
+        return 0.0
+    _, near = cKDTree(points).query(points, k=count + 1)
+    beside = values[near[:, 1:]].mean(axis=1)
+    return float(np.clip((values * beside).mean() / (values**2).mean(), 0.0, 1.0))
+
+
+def _of_the_state(state: State, expected: Expectations) -> list[_Finding]:
+    findings = []
+    movement = float(np.linalg.norm(state.displacement, axis=1).max())
+    if movement > expected.movement:
+        findings.append(
+            (Verdict.REFUSED, f"a node moved {1e3 * movement:.0f} mm; an organ of this size does not move more than "
+                              f"{1e3 * expected.movement:.0f} mm")
+        )  # fmt: skip
+    extent = state.extent
+    if extent is not None and extent > expected.extent:
+        verdict = Verdict.REFUSED if extent > 2.0 * expected.extent else Verdict.DOUBTFUL
+        findings.append((verdict, f"the load is {extent:.1f} times the largest that the surrogate has learned"))
+    pivots = state.negative_pivots
+    if pivots:
+        findings.append((Verdict.DOUBTFUL, f"the state is unstable: {pivots} negative pivots of its tangent"))
+    return findings
+
+
+def _of_the_pose(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
+    if problem.pose is None:
+        return []
+    largest = float(np.abs(found.trial.coefficients[problem.forces.size :]).max())
+    if largest <= expected.pose:
+        return []
+    return [
+        (Verdict.DOUBTFUL, f"the pose lies {largest:.1f} deviations from where it was expected; give a better start")
+    ]

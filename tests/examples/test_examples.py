@@ -1,0 +1,34 @@
+"""Every example runs, and says what it promises."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import follow_a_stream
+import own_forward_model
+import pytest
+import register_a_cloud
+
+EXAMPLES = {"register_a_cloud", "follow_a_stream", "own_forward_model"}
+
+
+def test_every_example_is_tested_here() -> None:
+    folder = Path(own_forward_model.__file__).parent
+    assert {path.stem for path in folder.glob("*.py")} == EXAMPLES
+
+
+def test_register_a_cloud(small_quickstart: Path, capsys) -> None:
+    """The tumour moved by more than 5 mm; the small twin, of 24 samples, finds it to a quarter of that."""
+    assert register_a_cloud.main(small_quickstart) < 2e-3
+    assert "the tumour was" in capsys.readouterr().out
+
+
+def test_follow_a_stream(small_quickstart: Path, capsys) -> None:
+    verdicts = follow_a_stream.main(small_quickstart)
+    assert [number for number, verdict in enumerate(verdicts) if verdict == "refused"] == [2]
+    assert "frame 2: refused: cloud" in capsys.readouterr().out
+
+
+def test_own_forward_model(capsys) -> None:
+    assert own_forward_model.main() == pytest.approx(0.0, abs=0.02)  # half a millimetre of noise on 40 mm of movement
+    assert "accepted" in capsys.readouterr().out

@@ -1,0 +1,113 @@
+"""Distances of a cloud to a moving surface: closest, one-sided, with exact derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.closest import ClosestPoints, closest_in_triangles
+from softtwin.registration.evidence import Scale
+from softtwin.registration.forward import reduce_model
+from softtwin.registration.pose import Pose
+from softtwin.registration.problem import Problem
+from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.thinning import thinned
+from softtwin.registration.unknowns import PosePrior, nodal_forces
+
+from .conftest import Cantilever, cloud_on, tip_forces
+
+
+@pytest.fixture(scope="module")
+def observed(body: Body) -> SurfaceDistance:
+    return SurfaceDistance(body, body.surfaces["observed"])
+
+
+def test_rows_are_the_derivative_of_the_distances(body: Body, observed: SurfaceDistance, rng) -> None:
+    cloud = cloud_on(body, np.zeros_like(body.points), 80, rng, noise=5e-3)
+    u = 1e-3 * rng.standard_normal((len(observed.nodes), 3))
+    direction = rng.standard_normal(u.shape)
+    start = observed.match(u, cloud)
+    slope = observed.rows(start) @ direction.ravel()
+    steps = 2e-4 * 0.5 ** np.arange(5)
+    moved = [observed.match(u + h * direction, cloud).distances for h in steps]
+    errors = [np.median(np.abs(m - start.distances - h * slope)) for m, h in zip(moved, steps, strict=True)]
+    assert np.median(np.log2(np.divide(errors[:-1], errors[1:]))) > 1.9
+
+
+def test_all_coefficients_pass_the_taylor_test(body: Body, observed: SurfaceDistance, rng) -> None:
+    """Forces and pose together, at a state and a pose that are far from rest."""
+    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 1.0))
+    prior = PosePrior(Pose.identity(), body.points.mean(axis=0))
+    model = reduce_model(Cantilever(body), observed.nodes, forces.basis)
+    cloud = cloud_on(body, np.zeros_like(body.points), 80, rng, noise=5e-3)
+    problem = Problem(model, observed, forces, prior, cloud, Scale(1e-3, 1.0))
+    here = np.concatenate([0.02 * rng.standard_normal(forces.size), rng.standard_normal(6)])
+    along = np.concatenate([0.02 * rng.standard_normal(forces.size), rng.standard_normal(6)])
+    start = problem.trial(here)
+    slope = problem.jacobian(start) @ along
+    steps = 0.02 * 0.5 ** np.arange(4)
+    moved = [problem.trial(here + h * along, start).match.distances for h in steps]
+    errors = [np.median(np.abs(m - start.match.distances - h * slope)) for m, h in zip(moved, steps, strict=True)]
+    assert np.median(np.log2(np.divide(errors[:-1], errors[1:]))) > 1.9
+    cotangent = rng.standard_normal(len(cloud))
+    np.testing.assert_allclose(problem.pulled(start, cotangent), cotangent @ problem.jacobian(start), rtol=1e-9)
+
+
+def test_closest_points_are_the_closest(body: Body, observed: SurfaceDistance, rng) -> None:
+    cloud = cloud_on(body, np.zeros_like(body.points), 40, rng, noise=2e-2)
+    found = np.abs(observed.match(np.zeros((len(observed.nodes), 3)), cloud).distances)
+    weights = rng.dirichlet(np.ones(3), size=4000)
+    dense = np.einsum("qk,tki->tqi", weights, body.points[body.surfaces["observed"]]).reshape(-1, 3)
+    brute = np.linalg.norm(cloud[:, None] - dense[None], axis=2).min(axis=1)
+    assert (found <= brute + 1e-12).all() and (brute - found).max() < 5e-3  # sampling finds nothing nearer
+
+
+def test_following_finds_what_searching_finds(body: Body, rng) -> None:
+    """After a move, but for a few points beside an edge, where a local minimum is not the global one."""
+    closest = ClosestPoints(body.surfaces["observed"], len(body.points))
+    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement
+    cloud = cloud_on(body, truth, 200, rng, noise=1e-3)
+    before, _ = closest.find(body.points, cloud)
+    positions = (body.points + truth)[body.surfaces["observed"]]
+    lengths = [
+        np.linalg.norm(np.einsum("pk,pki->pi", weights, positions[triangles]) - cloud, axis=1)
+        for triangles, weights in (
+            closest.find(body.points + truth, cloud),
+            closest.follow(body.points + truth, cloud, before),
+        )
+    ]
+    assert (lengths[1] >= lengths[0] - 1e-12).all()
+    assert np.isclose(*lengths, atol=1e-12).mean() > 0.9
+
+
+def test_the_closest_point_of_a_triangle_lies_in_it(rng) -> None:
+    corners, points = rng.standard_normal((500, 3, 3)), 3.0 * rng.standard_normal((500, 3))
+    weights, squares = closest_in_triangles(corners, points)
+    assert weights.min() > -1e-12
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    samples = np.einsum("qk,pki->pqi", rng.dirichlet(np.full(3, 0.5), size=2000), corners)
+    brute = ((samples - points[:, None]) ** 2).sum(axis=2).min(axis=1)
+    assert (squares <= brute + 1e-9).all()
+    places = np.einsum("pk,pki->pi", weights, corners)
+    np.testing.assert_allclose(((places - points) ** 2).sum(axis=1), squares, rtol=1e-8)
+
+
+def test_what_is_not_seen_pulls_nothing(body: Body, observed: SurfaceDistance, rng) -> None:
+    """Points of one corner of the observed side touch no other node."""
+    corner = cloud_on(body, np.zeros_like(body.points), 400, rng, noise=1e-3)
+    corner = corner[corner[:, 0] < 0.15]
+    match = observed.match(np.zeros((len(observed.nodes), 3)), corner)
+    pull = (observed.rows(match).T @ match.distances).reshape(-1, 3)
+    assert np.abs(pull[observed.rest[:, 0] > 0.3]).max() == 0.0
+    assert np.abs(pull).max() > 0.0
+
+
+def test_thinning_keeps_points_and_spreads_them(rng) -> None:
+    cloud = np.concatenate([rng.random((20_000, 3)), 0.01 * rng.random((20_000, 3))])
+    kept = thinned(cloud, 1000)
+    assert 600 < len(kept) <= 1000 and len(np.unique(kept)) == len(kept)
+    assert (cloud[kept].max(axis=1) < 0.011).mean() < 0.05  # half of the points lie in that corner
+    assert np.array_equal(thinned(cloud[:50], 100), np.arange(50))
+    with pytest.raises(ValueError, match=r"thinned\.most: expected at least 1"):
+        thinned(cloud, 0)

@@ -1,0 +1,88 @@
+"""Forces whose place is unknown are gathered where they act: on the linear response of a membrane of springs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from softtwin.meshes.body import Body
+from softtwin.registration.registrar import RegistrationOptions, prepare
+
+from .conftest import cloud_on, seen_from_above
+
+
+@dataclass(frozen=True, eq=False)
+class SpringState:
+    displacement: np.ndarray
+    inverse: np.ndarray
+    negative_pivots: int | None = 0
+    extent: float | None = None
+
+    def push(self, changes: ArrayLike) -> np.ndarray:
+        moved = np.asarray(changes).reshape(len(self.inverse), -1)
+        return (self.inverse @ moved).reshape(3 * len(self.inverse), -1)
+
+    def pull(self, cotangent: ArrayLike) -> np.ndarray:
+        return self.inverse.T @ np.asarray(cotangent)
+
+
+class Springs:
+    """u = K^-1 f, K a sum of springs along the edges: forces act where they are, unlike in the cantilever."""
+
+    error = 0.0
+
+    def __init__(self, body: Body) -> None:
+        self.body = body
+        n = len(body.points)
+        stiffness = np.zeros((n, n))
+        for cell in body.cells:
+            for i in cell:
+                for j in cell:
+                    if i < j:
+                        stiffness[[i, j], [i, j]] += 1.0
+                        stiffness[[i, j], [j, i]] -= 1.0
+        free = body.free
+        self.inverse = np.zeros((n, n))
+        self.inverse[np.ix_(free, free)] = np.linalg.inv(stiffness[np.ix_(free, free)])
+
+    def solve(self, forces: ArrayLike, near: Any = None) -> SpringState:
+        return SpringState(self.inverse @ np.asarray(forces), self.inverse)
+
+
+@pytest.mark.parametrize("noise", [3e-4, 2e-3])
+def test_gathering_finds_the_place_and_the_state(rng, noise: float) -> None:
+    body = seen_from_above((12, 4, 4))
+    model = Springs(body)
+    observed = np.unique(body.surfaces["observed"])
+    middle = observed[np.argmin(np.linalg.norm(body.points[observed] - [0.5, 0.2, 0.2], axis=1))]
+    tool = np.setdiff1d(
+        observed[np.linalg.norm(body.points[observed] - body.points[middle], axis=1) < 0.11], body.fixed
+    )
+    forces = np.zeros_like(body.points)
+    forces[tool] = np.array([0.0, 0.3, 0.7]) / len(tool)
+    truth = model.solve(forces).displacement
+    cloud = cloud_on(body, truth, 500, rng, noise)
+    errors, shares = [], []
+    for rounds in (0, 3):
+        made = prepare(
+            model,
+            body.boundary_nodes,
+            body.surfaces["observed"],
+            force_scale=1e-2,
+            smoothness=0.08,
+            options=RegistrationOptions(rounds=rounds),
+        )
+        result = made.register(cloud)
+        assert result.outcome.is_success and result.judgement.is_usable
+        # Along its own length a straight side slides freely: what is seen is what must be found.
+        errors.append(np.linalg.norm((result.displacement - truth)[:, 1:], axis=1).mean())
+        size = np.linalg.norm(result.forces, axis=1)
+        near = np.linalg.norm(body.points - body.points[middle], axis=1) < 0.2
+        shares.append(size[near].sum() / size.sum())
+    assert shares[1] > 0.85 and shares[1] > shares[0]
+    assert errors[1] < 0.1 * np.linalg.norm(truth, axis=1).mean()
+    assert errors[1] < errors[0] + 1e-4
