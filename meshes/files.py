@@ -170,8 +170,9 @@ def read_cloud(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Float
         raise ContentError(f"{path}: expected a cloud with points, got none.")
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points).all(axis=1)).sum())
-        raise ContentError(f"{path}: expected finite coordinates, got NaN or infinity in {bad} of {len(points)}; "
-                           "remove them.")  # fmt: skip
+        raise ContentError(
+            f"{path}: expected finite coordinates, got NaN or infinity in {bad} of {len(points)} points; remove them."
+        )
     return _placed(path, points, unit, axes, smallest=0.0)
 
 

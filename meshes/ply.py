@@ -185,7 +185,7 @@ def _triangles(columns: dict[str, dict[str, Column]]) -> Ints:
 def _by_length(polygons: Column) -> list[NDArray[np.generic]]:
     """Polygons of one length together, (m, k) each."""
     if isinstance(polygons, np.ndarray):
-        return [polygons]
+        return [polygons] if len(polygons) else []  # a cloud may have an element `face` without rows
     lengths = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
     return [np.stack([polygons[i] for i in np.flatnonzero(lengths == k)]) for k in np.unique(lengths)]
 

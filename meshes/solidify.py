@@ -24,8 +24,8 @@ _LOWEST_QUALITY = 1e-3  # radius ratio below which a tetrahedron is a sliver tha
 _GOOD_JACOBIAN = 0.25  # scaled: cells below are mended where that goes
 # How far the boundary may lie from the surface: this part of its size, or for coarse cells this part of their edge.
 _TOLERANCE, _TOLERANCE_OF_EDGE = 3e-3, 0.08
-# Of the cells' edge: with finer triangles fTetWild takes up to ten times as long, and coarsens them all the same.
-_TRIANGLE_EDGE = 0.9
+# Of the cells' edge: finer triangles take up to ten times as long in fTetWild; coarser ones lose volume.
+_TRIANGLE_EDGE = 0.6
 _EDGE_RATIO = 1.4  # fTetWild's wanted edge over the mean edge that it makes
 # Nodes are about this times volume / size^3 and this times area / size^2 (measured on organ surfaces).
 _NODES_IN_CUBE, _NODES_ON_SQUARE = 0.72, 1.44

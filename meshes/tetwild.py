@@ -49,7 +49,8 @@ def tetrahedra(surface: Surface, edge_length: float, tolerance: float) -> tuple[
             edge_length=edge_length / size,
             tolerance=tolerance / size,
         )
-        ended = subprocess.run([sys.executable, "-m", __name__, given, made], capture_output=True, text=True)
+        program = [sys.executable, "-m", __name__, str(given), str(made)]
+        ended = subprocess.run(program, capture_output=True, text=True, cwd=folder)  # it leaves a file where it runs
         if ended.returncode != 0 or not made.exists():
             raise SurfaceError(
                 f"surface: fTetWild ended with code {ended.returncode} and gave no solid "
