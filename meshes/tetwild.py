@@ -5,7 +5,6 @@ A process of its own, so that Ctrl-C ends it at once and a crash of its C++ is a
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -65,7 +64,6 @@ def tetrahedra(surface: Surface, edge_length: float, tolerance: float) -> tuple[
 def _main(given: str, made: str) -> None:
     from pytetwild.pytetwild import tetrahedralize  # of the extra `mesh`
 
-    os.chdir(Path(made).parent)  # it leaves a file of its own in the folder where it runs
     with np.load(given) as surface:
         points, cells = tetrahedralize(
             surface["points"],

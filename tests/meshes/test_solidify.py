@@ -17,9 +17,10 @@ from softtwin.meshes.metrics import scaled_jacobians
 from softtwin.meshes.solidify import MOST_NODES, Solid, solidify
 
 SIZE = 0.018
-# fTetWild's tolerance about the thinned surface, whose triangles have 0.9 of the cells' edge; in its middle a triangle
-# of edge h sags by h^2 / 6R on a sphere of radius R.
-REACH = max(3e-3 * 0.1 * np.sqrt(3), 0.08 * SIZE) + (0.9 * SIZE) ** 2 / (6 * 0.05)
+# fTetWild's tolerance about the thinned surface; in its middle a triangle of edge h sags by h^2 / 6R on a sphere of
+# radius R.
+REACH = max(module._TOLERANCE * 0.1 * np.sqrt(3), module._TOLERANCE_OF_EDGE * SIZE)
+REACH += (module._TRIANGLE_EDGE * SIZE) ** 2 / (6 * 0.05)
 
 
 def joined(*surfaces: Surface) -> Surface:
