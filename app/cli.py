@@ -205,7 +205,7 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 @click.option(
     "--frame",
     type=click.Choice(["lps", "ras"], case_sensitive=False),
-    help="Frame of the files that say none. One in another frame than the organ's is turned.",
+    help="Frame of the files that say none.",
 )
 @click.option("--observed", multiple=True, metavar="WHERE", help="The side that a camera sees.")
 @click.option("--zone", "zones", multiple=True, metavar="NAME=WHERE", help="Where tools may touch (may be repeated).")

@@ -10,6 +10,9 @@ from typing import Annotated, Any, Literal, get_args
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from softtwin.meshes.attachment import parse_file
+from softtwin.meshes.files import Frame
+
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 
@@ -42,7 +45,7 @@ class BodySection(_Section):
     unit: Literal["m", "cm", "mm"] = Field("m", description="unit of length in the files")
     frame: Literal["", "lps", "ras"] = Field(
         "",
-        description="frame of the files that say none, lps or ras; a file in another frame than the source is turned",
+        description="frame of the files that say none, lps or ras; files in ras are turned, inside it is lps",
     )
     cell_size: float = Field(0.0, ge=0.0, description="edge length of the tetrahedra in metres; 0: from nodes")
     nodes: Count = Field(2000, description="number of nodes wanted where a surface is made solid and cell_size is 0")
@@ -190,12 +193,21 @@ class Config(_Section):
     def _modes_fit_the_nodes(self) -> Config:
         """Refuse before meshing what no mesh of so many nodes has; the mesh itself is asked again."""
         most = 3 * self.body.nodes // 2
-        solid = self.body.cell_size == 0.0 and Path(self.body.source).suffix.lower() in _SURFACES
+        solid = self.body.cell_size == 0.0 and parse_file(self.body.source).path.suffix.lower() in _SURFACES
         if solid and self.loads.modes > most:
             raise ValueError(
                 f"loads.modes: expected at most {most} with body.nodes = {self.body.nodes}, got {self.loads.modes}"
             )
         return self
+
+
+def files_frame(section: BodySection) -> Frame | None:
+    """The frame of a body's source, and of all files and coordinates that say none; None where nobody says.
+
+    Args:
+        section: the configuration's [body].
+    """
+    return parse_file(section.source).frame or section.frame or None
 
 
 def read_config(path: Path | str) -> tuple[Config, Path]:

@@ -19,6 +19,7 @@ from softtwin.meshes.attachment import (
     median_edge,
     parse_file,
     parse_regions,
+    turned,
 )
 from softtwin.meshes.body import Body, BodyError, Surface
 from softtwin.meshes.embedding import embed
@@ -36,7 +37,7 @@ from softtwin.meshes.files import (
 from softtwin.meshes.shapes import beam, liver_phantom, propeller
 from softtwin.meshes.solidify import solidify
 
-from .config import BodySection, ConfigError
+from .config import BodySection, ConfigError, files_frame
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -60,19 +61,17 @@ class Organ:
 
 @dataclass(frozen=True)
 class _Reader:
-    """How the files of one body are read: where they lie, their unit, and the frame of the body (None: not known)."""
+    """How the files of one body are read: where they lie, their unit and frame (None: nobody says the source's)."""
 
     root: Path
     unit: Unit
-    given: Frame | None
-    body: Frame | None
+    frame: Frame | None
 
     def options(self, file: File) -> tuple[Path, Unit, Frame]:
-        """Path, unit and axes to read a file with; `ras` turns it, where its frame is another than the body's."""
+        """Path, unit and frame to read a file with; one that says no frame has that of the source."""
         path = self.root / file.path
-        frame = file.frame or stated_frame(path) or self.given
-        turned = self.body is not None and frame is not None and frame != self.body
-        return path, file.unit or self.unit, "ras" if turned else "lps"
+        frame = file.frame or stated_frame(path) or self.frame
+        return path, file.unit or self.unit, frame if frame and self.frame else "lps"
 
 
 def make_body(section: BodySection, root: Path) -> Body:
@@ -94,14 +93,15 @@ def make_organ(section: BodySection, root: Path) -> Organ:
     regions = _checked_regions(section, root)
     notes: list[str] = []
     if section.source in SHAPES:
-        reader = _Reader(root, section.unit, section.frame or None, section.frame or None)
+        reader = _Reader(root, section.unit, section.frame or "lps")
         body = SHAPES[section.source](**_shape_options(section))
     else:
         source = parse_file(section.source)
-        reader = _Reader(root, section.unit, section.frame or None, body_frame(section, root))
+        _check_stated_frame(section, root)
+        reader = _Reader(root, section.unit, files_frame(section))
         points, cells, notes = _solid(section, reader, source)
         body = Body(points, cells, {})
-        notes += [f"frame: {reader.body.upper()}"] if reader.body else []
+        notes += [f"frame: {reader.frame.upper()}, inside LPS" if reader.frame else "frame: none said, nothing turned"]
     for name, text in section.inner.items():
         surface = read_surface(*reader.options(parse_file(text)))
         notes += _outside(body, name, surface)
@@ -118,18 +118,18 @@ def make_organ(section: BodySection, root: Path) -> Organ:
     return Organ(body, tuple(notes))
 
 
-def body_frame(section: BodySection, root: Path) -> Frame | None:
-    """The frame of a body: what its source is said to have, or says itself, or `frame`; None where nobody says.
+def _check_stated_frame(section: BodySection, root: Path) -> None:
+    """Refuse a source in RAS whose configuration does not say so: clouds would be read in another frame later.
 
-    Args:
-        section: the configuration's [body].
-        root: folder that relative paths start from.
+    Raises:
+        ConfigError: with what to write.
     """
-    if section.source in SHAPES:
-        return section.frame or None
-    source = parse_file(section.source)
-    stated = stated_frame(root / source.path) if (root / source.path).is_file() else None
-    return source.frame or stated or section.frame or None
+    path = root / parse_file(section.source).path
+    if path.is_file() and stated_frame(path) == "ras" and files_frame(section) is None:
+        raise ConfigError(
+            f"body.source: {path} states that it is in RAS, which the configuration must say for what comes later: "
+            f'write source = "{section.source}:ras".'
+        )
 
 
 def _checked_regions(section: BodySection, root: Path) -> dict[str, tuple[Region, ...]]:
@@ -143,6 +143,8 @@ def _checked_regions(section: BodySection, root: Path) -> dict[str, tuple[Region
     texts = {"fixed": section.fixed, "observed": section.observed}
     texts |= {f"zones.{name}": text for name, text in section.zones.items()}
     regions = {name: parse_regions(text, section.unit) if text else () for name, text in texts.items()}
+    if files_frame(section) == "ras":
+        regions = {name: tuple(map(turned, group)) for name, group in regions.items()}
     structures = (*section.inner, *_OWN_STRUCTURES.get(section.source, ()))
     for region in (region for group in regions.values() for region in group):
         check_structure(region, structures)

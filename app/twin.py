@@ -39,7 +39,7 @@ from softtwin.registration.thinning import thinned
 from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Judgement, Verdict
 
-from .config import Config, ConfigError, RegistrationSection, parse_config
+from .config import Config, ConfigError, RegistrationSection, files_frame, parse_config
 from .inputs import check_material, load_plan
 from .workspace import open_workspace
 
@@ -369,7 +369,7 @@ def with_options(config: Config, options: dict[str, Any]) -> Config:
 
 def coordinates_of(config: Config) -> Coordinates:
     """Unit and axes of the files that a body was made from."""
-    return Coordinates(config.body.unit, "ras" if getattr(config.body, "frame", "").lower() == "ras" else "lps")
+    return Coordinates(config.body.unit, files_frame(config.body) or "lps")
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,6 +135,26 @@ def parse_regions(text: str, unit: Unit = "m") -> tuple[Region, ...]:
     return tuple(parse_region(part.strip(), unit) for part in text.split(" + "))
 
 
+def turned(region: Region) -> Region:
+    """The same region where RAS is LPS or the other way round: x and y of the other sign; a file stays.
+
+    Args:
+        region: the region.
+    """
+    if isinstance(region, Ball):
+        return Ball(_turned(region.centre), region.radius)
+    if isinstance(region, Box):
+        low, high = np.sort([_turned(region.low), _turned(region.high)], axis=0).tolist()
+        return Box(tuple(low), tuple(high))
+    if isinstance(region, HalfSpace):
+        return HalfSpace(_turned(region.point), _turned(region.normal))
+    return SeenFrom(_turned(region.position)) if isinstance(region, SeenFrom) else region
+
+
+def _turned(vector: Vector) -> Vector:
+    return (0.0 - vector[0], 0.0 - vector[1], vector[2])
+
+
 def parse_file(text: str) -> File:
     """The file that a text names: a path, with `:mm`, `:lps` or both behind it where its unit or frame differ.
 

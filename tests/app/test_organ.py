@@ -13,9 +13,9 @@ import pytest
 pytest.importorskip("pytetwild", reason="the extra mesh is absent")
 
 from softtwin.app import organ as module
-from softtwin.app.cli import main
-from softtwin.app.config import BodySection, parse_config
-from softtwin.app.organ import body_frame, make_organ
+from softtwin.app.cli import _with_frame, main
+from softtwin.app.config import BodySection, ConfigError, files_frame, parse_config
+from softtwin.app.organ import make_organ
 from softtwin.meshes.attachment import RegionError
 from softtwin.meshes.body import Body, BodyError
 from softtwin.meshes.files import FileError, UnitWarning
@@ -122,24 +122,53 @@ def _veins(files: Path, folder: Path, scale: float, turn: bool = False) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("source", "frame", "veins"),
-    [("organ.vtu:lps", "", ":ras"), ("organ.vtu", "ras", ":lps"), ("organ.vtu:ras", "lps", "")],
+    ("source", "frame", "veins", "turn"),
+    [
+        ("organ.vtu:lps", "", ":ras", True),
+        ("organ.vtu", "ras", ":lps", True),
+        ("organ.vtu:ras", "lps", ":lps", True),
+        ("organ.vtu:ras", "", "", False),
+        ("organ.vtu", "ras", "", False),
+        ("organ.vtu", "", ":ras", False),
+    ],
 )
-def test_a_file_in_the_other_frame_is_turned(files: Path, tmp_path: Path, source: str, frame: str, veins: str) -> None:
-    path = _veins(files, tmp_path, 1e3, turn=True)
-    body = make(files, source=source, frame=frame, fixed=f"{path}{veins}", fixed_distance=1e-4)
-    assert np.array_equal(body.fixed, make(files).fixed) and np.array_equal(body.points, make(files).points)
+def test_inside_all_is_lps(files: Path, tmp_path: Path, source: str, frame: str, veins: str, turn: bool) -> None:
+    """A file in the other frame than the source fits it once both are LPS; where the source says none nothing turns."""
+    path = _veins(files, tmp_path, 1e3, turn=turn)
+    made = section(files, source=source, frame=frame, fixed=f"{path}{veins}", fixed_distance=1e-4)
+    body, plain = make_organ(made, files).body, make(files)
+    assert np.array_equal(body.fixed, plain.fixed)
+    sign = [-1, -1, 1] if files_frame(made) == "ras" else [1, 1, 1]
+    assert np.array_equal(body.points, plain.points * sign)
 
 
-def test_a_frame_that_a_file_states_counts(files: Path, tmp_path: Path, phantom: Body) -> None:
-    meshio.Mesh(1e3 * phantom.points, [("triangle", phantom.boundary)]).write(tmp_path / "organ.ply", binary=False)
-    text = (tmp_path / "organ.ply").read_text()
-    (tmp_path / "organ.ply").write_text(
-        text.replace("ply\n", "ply\n", 1).replace("element", "comment SPACE=RAS\nelement", 1)
-    )
-    entries = section(files, source=str(tmp_path / "organ.ply"))
-    assert body_frame(entries, files) == "ras"
-    assert body_frame(section(files), files) is None and body_frame(section(files, frame="lps"), files) == "lps"
+@pytest.mark.parametrize(
+    "where", ["ball:8,18,-20:24", "box:-200,-200,-200:200,10,-35", "halfspace:60,0,0:1,0.2,0", "seen-from:500,90,0"]
+)
+def test_coordinates_in_words_are_in_the_frame_of_the_source(files: Path, where: str) -> None:
+    assert np.array_equal(make(files, fixed=where, source="organ.vtu:ras").fixed, make(files, fixed=where).fixed)
+
+
+def test_clouds_are_read_on_the_axes_of_the_body(files: Path, tmp_path: Path) -> None:
+    """A cloud beside a source in RAS must fall on the body that was made of it."""
+    from softtwin.app.twin import coordinates_of
+    from softtwin.meshes.files import read_cloud
+
+    np.savetxt(tmp_path / "cloud.txt", 1e3 * make(files).points, fmt="%.17g")
+    for entries in ({"source": "organ.vtu:ras"}, {"frame": "ras"}, {"source": "organ.vtu:lps"}, {}):
+        config = parse_config({"body": section(files, **entries).model_dump()})
+        place = coordinates_of(config)
+        cloud = read_cloud(tmp_path / "cloud.txt", place.unit, place.axes)
+        assert np.allclose(cloud, make(files, **entries).points, rtol=1e-15, atol=0)
+
+
+def test_a_source_that_states_ras_must_be_recorded(files: Path, tmp_path: Path, phantom: Body) -> None:
+    path = tmp_path / "organ.ply"
+    meshio.Mesh(1e3 * phantom.points, [("triangle", phantom.boundary)]).write(path, binary=False)
+    path.write_text(path.read_text().replace("element", "comment SPACE=RAS\nelement", 1))
+    with pytest.raises(ConfigError, match=r"states that it is in RAS, .* write source = \".*organ\.ply:ras\""):
+        make(files, source=str(path))
+    assert _with_frame(str(path)) == f"{path}:ras"  # what `softtwin build` writes
 
 
 def test_an_inner_surface_outside_the_organ_is_refused_and_a_part_outside_is_said(files: Path, tmp_path: Path) -> None:

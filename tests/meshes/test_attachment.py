@@ -16,6 +16,7 @@ from softtwin.meshes.attachment import (
     parse_file,
     parse_region,
     parse_regions,
+    turned,
 )
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.shapes import beam
@@ -122,3 +123,10 @@ def test_a_camera_sees_the_sides_that_face_it(bar: Body) -> None:
 def test_a_region_that_holds_nothing_is_refused(bar: Body, text: str, message: str) -> None:
     with pytest.raises(RegionError, match=message):
         boundary_nodes(parse_region(text), bar)  # type: ignore[arg-type]
+
+
+def test_turned_twice_is_the_same_region() -> None:
+    for text in ("ball:1,2,3:4", "box:1,2,3:4,5,6", "halfspace:1,2,3:1,0,2", "seen-from:1,2,3", "near:a:1", "a.ply"):
+        region = parse_region(text)
+        assert turned(turned(region)) == region
+    assert turned(Box((1, 2, 3), (4, 5, 6))) == Box((-4, -5, 3), (-1, -2, 6))

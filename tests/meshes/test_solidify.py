@@ -2,6 +2,7 @@ import logging
 import re
 import signal
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from softtwin.meshes.metrics import scaled_jacobians
 from softtwin.meshes.solidify import MOST_NODES, Solid, solidify
 
 SIZE = 0.018
-# The thinned surface and its boundary may lie this far from the surface: part of its size, 0.1 m times root 3.
-REACH = max(3e-3 * 0.1 * np.sqrt(3), 0.08 * SIZE)
+# fTetWild's tolerance about the thinned surface; in its middle a triangle of edge h sags by h^2 / 6R on a sphere of
+# radius R.
+REACH = max(module._TOLERANCE * 0.1 * np.sqrt(3), module._TOLERANCE_OF_EDGE * SIZE)
+REACH += (module._TRIANGLE_EDGE * SIZE) ** 2 / (6 * 0.05)
 
 
 def joined(*surfaces: Surface) -> Surface:
@@ -161,9 +164,13 @@ def test_a_crash_of_the_mesher_is_a_message(ball: Surface, monkeypatch: pytest.M
         solidify(ball, cell_size=SIZE)
 
 
-def test_the_mesher_leaves_ctrl_c_alone_and_says_nothing(ball: Surface, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_mesher_leaves_ctrl_c_alone_says_nothing_and_leaves_no_file(
+    ball: Surface, capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     before = signal.getsignal(signal.SIGINT)
     solidify(ball, cell_size=0.03)
+    assert list(tmp_path.iterdir()) == []
     assert signal.getsignal(signal.SIGINT) is before
     assert capfd.readouterr() == ("", "")
 
