@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -166,10 +166,20 @@ class Twin:
         """
         if camera == "align":
             camera = self.aligned(cloud)
+        return self._posed_result(cloud, zone, camera, lambda registrar, points: registrar.register(points, start))
+
+    def follow(self, cloud: ArrayLike, zone: str | None, last: Registration | None, camera: Camera) -> Registration:
+        """A cloud registered from the last frame, and from rest where that is not accepted; see `Registrar.follow`."""
+        return self._posed_result(cloud, zone, camera, lambda registrar, points: registrar.follow(points, last))
+
+    def _posed_result(
+        self, cloud: ArrayLike, zone: str | None, camera: Camera, run: Callable[[Registrar, Floats], Registration]
+    ) -> Registration:
+        points = np.asarray(cloud, dtype=np.float64)
         if isinstance(camera, Pose):
-            inner = camera.inverse().apply(np.asarray(cloud, dtype=np.float64))
-            return replace(self.registrar(zone).register(inner, start), pose=camera)
-        return self.registrar(zone, camera).register(cloud, start)
+            return replace(run(self.registrar(zone), camera.inverse().apply(points)), pose=camera)
+        assert camera != "align"
+        return run(self.registrar(zone, camera), points)
 
     def stream(self, clouds: Iterable[ArrayLike], zone: str | None = None, camera: Camera = None) -> Iterator[Frame]:
         """Clouds registered in their order as they come, each from the last result that was not refused.
@@ -300,7 +310,7 @@ class Sequence:
         try:
             if self.camera == "align":
                 self.camera = self.twin.aligned(points)
-            result = self._registered(points)
+            result = self.twin.follow(points, self.zone, self._last, self.camera)
         except (CloudError, NotConverged) as error:
             return self.refuse(str(error), time.perf_counter() - begin)
         if result.judgement.is_usable:
@@ -314,21 +324,6 @@ class Sequence:
             return points
         return points[thinned(points, self.twin.config.registration.points)]
 
-    def _registered(self, cloud: ArrayLike) -> Registration:
-        """From the last frame; what is not accepted is tried from rest too, lest one bad frame spoil those after it."""
-        warm = None
-        if self._last is not None:
-            with suppress(NotConverged):
-                warm = self.twin.register(cloud, self.zone, self._last, self.camera)
-            if warm is not None and (warm.judgement.verdict is Verdict.ACCEPTED or self._began_anew(warm)):
-                return warm
-        cold = self.twin.register(cloud, self.zone, None, self.camera)
-        return cold if warm is None else min(warm, cold, key=_badness)
-
-    def _began_anew(self, result: Registration) -> bool:
-        """True where the registrar itself has gone back to rest: its forces were gathered again."""
-        return self._last is not None and result.prepared is not self._last.prepared
-
     def refuse(self, reason: str, seconds: float = 0.0) -> Frame:
         """The next frame without a result: its cloud cannot be used.
 
@@ -341,10 +336,6 @@ class Sequence:
     def _next(self) -> int:
         self._count += 1
         return self._count - 1
-
-
-def _badness(result: Registration) -> tuple[int, float]:
-    return list(Verdict).index(result.judgement.verdict), result.noise
 
 
 def _options(section: RegistrationSection, rounds: int) -> RegistrationOptions:

@@ -54,6 +54,7 @@ class Cantilever:
     body: Body
     stiffness: float = 5.0  # newtons per metre at the tip
     error: float = 0.0  # metres; it is the truth here
+    discrepancy: None = None
 
     def bent(self, forces: Floats) -> Floats:
         """Displacement, (n, 3), metres, under nodal forces, (n, 3), newtons."""

@@ -8,10 +8,12 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from .body import Floats, Ints, Surface
 from .checks import SurfaceError
@@ -49,16 +51,33 @@ def tetrahedra(surface: Surface, edge_length: float, tolerance: float) -> tuple[
             tolerance=tolerance / size,
         )
         program = [sys.executable, "-m", __name__, str(given), str(made)]
-        ended = subprocess.run(program, capture_output=True, text=True, cwd=folder)  # it leaves a file where it runs
-        if ended.returncode != 0 or not made.exists():
+        code, errors = _run(program, folder)
+        if code != 0 or not made.exists():
             raise SurfaceError(
-                f"surface: fTetWild ended with code {ended.returncode} and gave no solid "
-                f"({' '.join(ended.stderr.split())[-200:]}); try another number of nodes or cell size, or mend the "
+                f"surface: fTetWild ended with code {code} and gave no solid "
+                f"({' '.join(errors.split())[-200:]}); try another number of nodes or cell size, or mend the "
                 "surface where it was segmented."
             )
         with np.load(made) as solid:
             points, cells = solid["points"], solid["cells"].astype(np.int64)
     return middle + size * points, cells
+
+
+def _run(program: list[str], folder: str) -> tuple[int, str]:
+    """Code and error output of a program that runs in a folder, with a clock on a terminal; it dies with its caller."""
+    clock = tqdm(desc="making the surface solid", bar_format="{desc} {elapsed}", disable=None, leave=False)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    with clock, subprocess.Popen(program, text=True, cwd=folder, **quiet) as run:
+        errors = None
+        try:
+            while errors is None:
+                with suppress(subprocess.TimeoutExpired):
+                    errors = run.communicate(timeout=1.0)[1]
+                clock.refresh()
+        except BaseException:
+            run.kill()
+            raise
+    return run.returncode, errors
 
 
 def _main(given: str, made: str) -> None:

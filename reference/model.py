@@ -52,6 +52,10 @@ class ReferenceModel:
         """0: it is what others are measured by."""
         return 0.0
 
+    @property
+    def discrepancy(self) -> None:
+        """None, for the same reason."""
+
     def solve(self, forces: ArrayLike, near: Start | None = None) -> ReferenceState:
         """The state under nodal forces, (n, 3) newtons.
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 Floats = NDArray[np.float64]
 _STEP = 0.1  # of the logarithm of each scale on its grid
@@ -83,9 +84,18 @@ class Linearised:
 
 
 def linearised(
-    jacobian: Floats, residuals: Floats, weights: Floats, coefficients: Floats, consistency: float
+    jacobian: Floats,
+    residuals: Floats,
+    weights: Floats,
+    coefficients: Floats,
+    consistency: float,
+    noise: float = 1.0,
+    beside: tuple[Floats, Floats] | None = None,
 ) -> Linearised:
     """The linear problem about a state.
+
+    Unknowns beside those whose scale is wanted are integrated out with their unit variance at the noise so far: in the
+    formulas W gives way to (W^-1 + N N^T / sigma^2)^-1.
 
     Args:
         jacobian: derivative of the residuals by the coefficients, (p, k).
@@ -93,17 +103,29 @@ def linearised(
         weights: of the points, (p,), between 0 and 1.
         coefficients: at the state, (k,).
         consistency: of the loss that gave the weights.
+        noise: standard deviation of a point's distance so far, metres.
+        beside: N, derivative of the residuals by unknowns of unit variance, (p, q), and their values, (q,).
     """
-    data = jacobian @ coefficients - residuals
-    weighted: Floats = weights[:, None] * jacobian
-    values, vectors = np.linalg.eigh(jacobian.T @ weighted)
-    values = np.maximum(np.asarray(values, dtype=np.float64), 0.0)
-    pulled: Floats = weighted.T @ data
-    projections = vectors.T @ pulled
-    seen = values > _SEEN * values.max(initial=0.0)
-    explained = float((projections[seen] ** 2 / values[seen]).sum())
-    rest = max(float(data @ (weights * data)) - explained, 0.0) / consistency
-    return Linearised(vectors, values, projections, rest, float(weights.sum()))
+    root = np.sqrt(weights)
+    inner = root[:, None] * jacobian
+    data = root * (jacobian @ coefficients - residuals)
+    matrix, pulled, square = inner.T @ inner, inner.T @ data, float(data @ data)
+    if beside is not None and beside[0].shape[1]:
+        columns, values = beside
+        data = data + root * (columns @ values)
+        outer = (root / noise)[:, None] * columns
+        factor = cho_factor(np.eye(len(values)) + outer.T @ outer)
+        cross, across = outer.T @ inner, outer.T @ data
+        matrix = matrix - cross.T @ cho_solve(factor, cross)
+        pulled = inner.T @ data - cross.T @ cho_solve(factor, across)
+        square = float(data @ data - across @ cho_solve(factor, across))
+    information, vectors = np.linalg.eigh(matrix)
+    information = np.maximum(np.asarray(information, dtype=np.float64), 0.0)
+    projections: Floats = vectors.T @ pulled
+    seen = information > _SEEN * information.max(initial=0.0)
+    explained = float((projections[seen] ** 2 / information[seen]).sum())
+    rest = max(square - explained, 0.0) / consistency
+    return Linearised(vectors, information, projections, rest, float(weights.sum()))
 
 
 @dataclass(frozen=True, eq=False)

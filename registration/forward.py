@@ -39,6 +39,21 @@ class State(Protocol):
         """
 
 
+class Discrepancy(Protocol):
+    """What a model gets wrong: u = u_model + size (modes a + rest) with a of unit variance.
+
+    The size is the largest displacement of a node.
+    """
+
+    @property
+    def modes(self) -> Floats:
+        """Patterns of the error over the body for a largest displacement of one metre, (3n, m)."""
+
+    @property
+    def rest(self) -> float:
+        """Standard deviation of a component of what they leave out, for the same displacement."""
+
+
 class ForwardModel(Protocol):
     """Nodal forces to states.
 
@@ -52,6 +67,10 @@ class ForwardModel(Protocol):
     @property
     def error(self) -> float:
         """Error of the displacement to be reckoned with where it is worst, metres; 0 for the reference."""
+
+    @property
+    def discrepancy(self) -> Discrepancy | None:
+        """The same as patterns, which tell error from noise; None where they are not known."""
 
     def solve(self, forces: ArrayLike, near: Any = None) -> State:
         """The state under nodal forces, (n, 3) newtons.

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from softtwin.reference.outcome import NotConverged
 
@@ -204,7 +206,7 @@ class LocalModel:
         distances = trial.match.distances
         self.jacobian = problem.jacobian(trial)
         weights = loss.weight(distances / noise)
-        self.scales, self.is_graduated = self._found_scales(loss, weights, graduation)
+        self.scales, self.is_graduated = self._found_scales(loss, weights, noise, graduation)
         self.noise = self.scales.noise
         self.weights = loss.weight(distances / self.noise)
         self.precision = np.ones(problem.size)
@@ -213,36 +215,38 @@ class LocalModel:
         self._hessian = self.information / self.noise**2 + np.diag(self.precision)
         self.gradient = self.jacobian.T @ (self.weights * distances) / self.noise**2
         self.gradient += self.precision * trial.coefficients
-        self._values, self._vectors = np.linalg.eigh(self._scaled(self._hessian))
         self.value = self.objective(trial, loss)
 
-    def _found_scales(self, loss: Loss, weights: Floats, graduation: float) -> tuple[Scales, bool]:
+    def _found_scales(self, loss: Loss, weights: Floats, noise: float, graduation: float) -> tuple[Scales, bool]:
         """Scales, and whether the noise is held above what the linear model alone would believe."""
-        problem = self.problem
-        jacobian, residuals = self.jacobian[:, problem.force_part], self.trial.match.distances
-        if problem.pose is not None:
-            jacobian, residuals = self._without_pose(jacobian, residuals, weights)
-        coefficients = self.trial.coefficients[problem.force_part]
-        local = linearised(jacobian, residuals, weights, coefficients, loss.consistency)
+        problem, part = self.problem, self.problem.force_part
+        beside = self.jacobian[:, part.stop :], self.trial.coefficients[part.stop :]
+        coefficients, residuals = self.trial.coefficients[part], self.trial.match.distances
+        jacobian = self.jacobian[:, part]
+        local = linearised(jacobian, residuals, weights, coefficients, loss.consistency, noise, beside)
         scales = find_scales(local, problem.noise, problem.forces.scale)
         least = graduation * local.promised(scales, coefficients)
         if least <= scales.noise:
             return scales, False
         return find_scales(local, problem.noise.at_least(least), problem.forces.scale), True
 
-    def _without_pose(self, jacobian: Floats, residuals: Floats, weights: Floats) -> tuple[Floats, Floats]:
-        """The linear problem with what a pose can explain projected out."""
-        root = np.sqrt(weights)
-        turned = np.linalg.qr(root[:, None] * self.jacobian[:, self.problem.forces.size :])[0]
-        inner, rest = root[:, None] * jacobian, root * residuals
-        inner, rest = inner - turned @ (turned.T @ inner), rest - turned @ (turned.T @ rest)
-        safe = np.maximum(root, 1e-9)
-        return inner / safe[:, None], rest / safe
-
-    def _scaled(self, matrix: Floats) -> Floats:
+    @cached_property
+    def _scaled_hessian(self) -> Floats:
         """In coefficients of unit prior variance: forces in newtons and poses differ by orders of size."""
         root = 1.0 / np.sqrt(self.precision)
-        return root[:, None] * matrix * root
+        return root[:, None] * self._hessian * root
+
+    @cached_property
+    def _eigen(self) -> tuple[Floats, Floats]:
+        """For steps that have to be damped."""
+        values, vectors = np.linalg.eigh(self._scaled_hessian)
+        return values, vectors
+
+    @cached_property
+    def _whole(self) -> Floats:
+        """The whole step."""
+        root = 1.0 / np.sqrt(self.precision)
+        return -root * cho_solve(cho_factor(self._scaled_hessian), root * self.gradient)
 
     def objective(self, trial: Trial, loss: Loss) -> float:
         """Robust distances and prior at these scales."""
@@ -252,22 +256,21 @@ class LocalModel:
     @property
     def length(self) -> float:
         """Length of the whole step in posterior deviations a coefficient."""
-        whole = self._solve(0.0)
-        return float(np.sqrt(max(-float(whole @ self.gradient), 0.0) / len(whole)))
+        return float(np.sqrt(max(-float(self._whole @ self.gradient), 0.0) / len(self._whole)))
 
-    def _solve(self, damping: float) -> Floats:
+    def _damped(self, damping: float) -> Floats:
+        values, vectors = self._eigen
         root = 1.0 / np.sqrt(self.precision)
-        rotated = self._vectors.T @ (root * self.gradient)
-        return -root * (self._vectors @ (rotated / (self._values + damping)))
+        rotated = vectors.T @ (root * self.gradient)
+        return -root * (vectors @ (rotated / (values + damping)))
 
     def step(self, limit: float) -> Floats:
         """The best change of the coefficients that moves no observed node further than the limit, metres."""
-        damping = 0.0
-        while True:
-            change = self._solve(damping)
-            if self.largest_movement(change) <= 1.05 * limit:
-                return change
-            damping = max(1.6 * damping, 1e-8 * self._values[-1], 0.1)
+        change, damping = self._whole, 0.0
+        while self.largest_movement(change) > 1.05 * limit:
+            damping = max(1.6 * damping, 1e-8 * self._eigen[0][-1], 0.1)
+            change = self._damped(damping)
+        return change
 
     def decrease(self, change: Floats) -> float:
         """Decrease of the objective that the model predicts."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,7 @@ from .evidence import Scale
 from .forward import ReducedModel, ReducedState
 from .pose import Pose
 from .residuals import Match, SurfaceDistance
-from .unknowns import Forces, PosePrior
+from .unknowns import Forces, ModelError, PosePrior
 
 Floats = NDArray[np.float64]
 
@@ -22,8 +22,9 @@ class Trial:
     """The problem at one set of coefficients.
 
     Args:
-        coefficients: of forces and pose, (k,) or (k + 6,).
-        state: the body's state.
+        coefficients: of forces, pose and model error, (k,).
+        state: the body's state as the model has it.
+        positions: displacement of the observed nodes with the model's error, (m, 3), metres.
         pose: from the body's coordinates to the cloud's; None where it is not unknown.
         cloud: points in the body's coordinates, (p, 3), metres.
         match: the cloud on the surface.
@@ -31,6 +32,7 @@ class Trial:
 
     coefficients: Floats
     state: ReducedState
+    positions: Floats
     pose: Pose | None
     cloud: Floats
     match: Match
@@ -47,6 +49,7 @@ class Problem:
         pose: the pose and its prior; None where the cloud is in the body's coordinates.
         cloud: points, (p, 3), metres.
         noise: what is believed of the standard deviation of a point's distance, metres.
+        error: what the model may get wrong; None where it is not known in patterns.
     """
 
     model: ReducedModel
@@ -55,16 +58,27 @@ class Problem:
     pose: PosePrior | None
     cloud: Floats
     noise: Scale
+    error: ModelError | None = None
 
     @property
     def size(self) -> int:
-        """Number of coefficients."""
-        return self.forces.size + (0 if self.pose is None else 6)
+        """Number of coefficients: those of the forces, of the pose, of the model's error."""
+        return self.pose_part.stop + (0 if self.error is None else self.error.count)
 
     @cached_property
     def force_part(self) -> slice:
         """Where the force coefficients are."""
         return slice(0, self.forces.size)
+
+    @cached_property
+    def pose_part(self) -> slice:
+        """Where those of the pose are."""
+        return slice(self.forces.size, self.forces.size + (0 if self.pose is None else 6))
+
+    @cached_property
+    def error_part(self) -> slice:
+        """Where those of the model's error are."""
+        return slice(self.pose_part.stop, None)
 
     def trial(self, coefficients: Floats, near: Trial | None = None, *, anew: bool = False) -> Trial:
         """The problem at some coefficients.
@@ -78,42 +92,50 @@ class Problem:
             NotConverged: the model found no state.
         """
         state = self.model.solve(coefficients[self.force_part], None if near is None else near.state)
-        pose = None if self.pose is None else self.pose.pose(coefficients[self.forces.size :])
+        positions = state.positions
+        if self.error is not None:
+            positions = positions + self.error.observed_field(coefficients[self.error_part])
+        pose = None if self.pose is None else self.pose.pose(coefficients[self.pose_part])
         cloud = self.cloud if pose is None else pose.inverse().apply(self.cloud)
-        match = self.observed.match(state.positions, cloud, None if near is None or anew else near.match)
-        return Trial(coefficients, state, pose, cloud, match)
+        match = self.observed.match(positions, cloud, None if near is None or anew else near.match)
+        return Trial(coefficients, state, positions, pose, cloud, match)
+
+    def correction(self, trial: Trial) -> Floats:
+        """What the model's error adds to the displacement of all nodes, (n, 3), metres."""
+        if self.error is None:
+            return np.zeros_like(self.observed.body.points)
+        return self.error.field(trial.coefficients[self.error_part])
 
     def again(self, trial: Trial) -> Trial:
         """The same trial with its closest points searched anew."""
-        return Trial(
-            trial.coefficients,
-            trial.state,
-            trial.pose,
-            trial.cloud,
-            self.observed.match(trial.state.positions, trial.cloud),
-        )
+        return replace(trial, match=self.observed.match(trial.positions, trial.cloud))
 
     def jacobian(self, trial: Trial) -> Floats:
         """Derivative of the distances by the coefficients, (p, k), exact."""
-        by_forces = trial.state.jacobian(self.observed.rows(trial.match))
-        if self.pose is None:
-            return by_forces
-        return np.hstack([by_forces, self._by_pose(trial)])
+        rows = self.observed.rows(trial.match)
+        blocks = [trial.state.jacobian(rows)]
+        if self.pose is not None:
+            blocks.append(self._by_pose(trial))
+        if self.error is not None:
+            blocks.append(rows @ self.error.modes)
+        return np.hstack(blocks)
 
     def pulled(self, trial: Trial, cotangent: Floats) -> Floats:
         """Gradient by the coefficients, (k,), from the one by the distances, (p,): J^T g with the adjoint."""
         by_nodes = (self.observed.rows(trial.match).T @ cotangent).reshape(-1, 3)
         full = np.zeros_like(self.observed.body.points)
         full[self.observed.nodes] = by_nodes
-        by_forces = trial.state.full.pull(full).ravel() @ self.forces.basis
-        if self.pose is None:
-            return by_forces
-        return np.concatenate([by_forces, cotangent @ self._by_pose(trial)])
+        blocks = [trial.state.full.pull(full).ravel() @ self.forces.basis]
+        if self.pose is not None:
+            blocks.append(cotangent @ self._by_pose(trial))
+        if self.error is not None:
+            blocks.append(by_nodes.ravel() @ self.error.modes)
+        return np.concatenate(blocks)
 
     def _by_pose(self, trial: Trial) -> Floats:
         """A point of the cloud stays where it is: in the body's coordinates it moves against the pose."""
         assert self.pose is not None and trial.pose is not None
-        twist = self.pose.deviations * trial.coefficients[self.forces.size :]
+        twist = self.pose.deviations * trial.coefficients[self.pose_part]
         centre = self.pose.mean.apply(self.pose.centre[None])[0]
         in_camera = self.pose.mean.moved_jacobian(trial.cloud, twist, centre).reshape(-1, 3, 6)
         along = trial.match.directions @ trial.pose.rotation.T  # directions in the camera's axes
@@ -123,7 +145,9 @@ class Problem:
         """How far the observed nodes move towards or from the cloud for a change, first order, (m,), metres."""
         shifted = trial.state.moved(change[self.force_part])
         if self.pose is not None:
-            twist = self.pose.deviations * change[self.forces.size :]
+            twist = self.pose.deviations * change[self.pose_part]
             arm = self.observed.rest - self.pose.centre
             shifted = shifted + (np.cross(twist[:3], arm) + twist[3:])
+        if self.error is not None:
+            shifted = shifted + self.error.observed_field(change[self.error_part])
         return np.sqrt(np.einsum("pi,pi->p", shifted, shifted))

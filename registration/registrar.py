@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import check_cloud
 from softtwin.meshes.metrics import edge_lengths
+from softtwin.reference.outcome import NotConverged
 
 from .evidence import Scale
 from .forward import ForwardModel, ReducedModel, State, reduce_model
@@ -23,8 +24,8 @@ from .pose import Pose
 from .problem import Problem, Trial
 from .residuals import SurfaceDistance
 from .thinning import thinned
-from .unknowns import Forces, Informed, PosePrior, contact, informed, nodal_forces, windowed
-from .verdict import Expectations, Judgement, judge
+from .unknowns import Forces, Informed, ModelError, PosePrior, contact, informed, nodal_forces, windowed
+from .verdict import Expectations, Judgement, Verdict, judge
 
 Floats = NDArray[np.float64]
 # Of the logarithm of a nodal force. A model with an error of its own must not explain that by forces.
@@ -85,7 +86,8 @@ class Registration:
         prepared: the forces' basis that its coefficients belong to.
         trial: where the solver ended; the next frame starts there.
         forces: nodal forces, (n, 3), newtons.
-        state: the body's state, with its derivatives.
+        state: the body's state as the model has it, with its derivatives.
+        correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres.
         pose: from the body's coordinates to the cloud's.
         net_force: (3,), newtons.
         net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
@@ -106,6 +108,7 @@ class Registration:
     trial: Trial
     forces: Floats
     state: State
+    correction: Floats
     pose: Pose
     net_force: Floats
     net_force_covariance: Floats
@@ -123,13 +126,13 @@ class Registration:
 
     @property
     def coefficients(self) -> Floats:
-        """Of forces and pose, (k,)."""
+        """Of forces, pose and model error, (k,)."""
         return self.trial.coefficients
 
     @property
     def displacement(self) -> Floats:
-        """Of all nodes, (n, 3), metres, in the body's coordinates."""
-        return self.state.displacement
+        """Of all nodes, (n, 3), metres, in the body's coordinates: the state's with the correction."""
+        return self.state.displacement + self.correction
 
     @property
     def net_force_deviation(self) -> Floats:
@@ -161,7 +164,10 @@ class Registrar:
     ) -> None:
         self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
         self.options = options or RegistrationOptions()
-        self.noise = self.options.noise.at_least(model.error)  # points tell no more than the model can meet
+        discrepancy = model.discrepancy
+        self.error = None if discrepancy is None else ModelError.of(discrepancy, observed.nodes)
+        # Where it is not known what the model gets wrong, points tell no more than the model can meet.
+        self.noise = self.options.noise.at_least(model.error)
         self.expectations = expectations or Expectations.of(model, self.noise)
         self._everywhere = Prepared.of(model, observed, forces)
         self._leading = Prepared.of(model, observed, forces.leading(_LEADING))
@@ -181,39 +187,66 @@ class Registrar:
         points = self._checked(cloud)
         if start is None:
             return self._cold(points, begin)
-        problem = self._problem(points, start.prepared)
-        found = self.options.solver.solve(problem, start.coefficients, start.trial)
+        problem = self._problem(points, start.prepared, start.trial)
+        found = self.options.solver.solve(problem, start.trial.coefficients, start.trial)
         result = self._result(problem, found, start.prepared, begin)
         if self.options.rounds and self._has_left(result, start):
             return self._cold(points, begin)
         return result
 
-    def _problem(self, points: Floats, prepared: Prepared) -> Problem:
-        return Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.noise)
+    def follow(self, cloud: ArrayLike, last: Registration | None) -> Registration:
+        """The next frame of a sequence: from the last one, and from rest where that is not accepted.
+
+        Args:
+            cloud: observed points, (p, 3), metres.
+            last: the last usable result; None for the first frame.
+
+        Raises:
+            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+            NotConverged: the model found no state at rest.
+        """
+        if last is None:
+            return self.register(cloud)
+        try:
+            warm = self.register(cloud, last)
+        except NotConverged:
+            return self.register(cloud)
+        began_anew = warm.prepared is not last.prepared
+        if warm.judgement.verdict is Verdict.ACCEPTED or began_anew:
+            return warm
+        return min(warm, self.register(cloud), key=_badness)
+
+    def _problem(self, points: Floats, prepared: Prepared, near: Trial | None = None) -> Problem:
+        """The problem; near a trial, whose size says how large the model's error may be, with it in patterns."""
+        plain = Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.noise)
+        if self.error is None or near is None:
+            return plain
+        moved = np.linalg.norm(near.positions, axis=1).max() + near.match.rms
+        error = replace(self.error, size=float(moved))
+        return replace(plain, error=error, noise=self.options.noise.at_least(error.rest))
 
     def _cold(self, points: Floats, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more from rest for each round of gathering them."""
         prepared = self._everywhere
-        found = self._from_rest(points, prepared, self._leading)
+        problem, found = self._from_rest(points, prepared, self._leading)
         for _ in range(self.options.rounds):
-            inner = found.trial.coefficients[: prepared.forces.size]
-            prepared = self._gathered(prepared.forces.forces(inner))
-            spent, found = found, self._from_rest(points, prepared)
+            prepared = self._gathered(prepared.forces.forces(found.trial.coefficients[problem.force_part]))
+            spent = found
+            problem, found = self._from_rest(points, prepared)
             found = _after(spent, found)
-        return self._result(self._problem(points, prepared), found, prepared, begin)
+        return self._result(problem, found, prepared, begin)
 
-    def _from_rest(self, points: Floats, prepared: Prepared, leading: Prepared | None = None) -> Found:
+    def _from_rest(self, points: Floats, prepared: Prepared, leading: Prepared | None = None) -> tuple[Problem, Found]:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
-        problem, solver = self._problem(points, prepared), self.options.solver
-        start = np.zeros(problem.size)
-        if prepared.forces.size <= _LEADING:
-            return solver.solve(problem, start)
+        solver = self.options.solver
         first = leading or Prepared.of(self.model, self.observed, prepared.forces.leading(_LEADING))
         rough = self._problem(points, first)
         begun = solver.rough().solve(rough, np.zeros(rough.size))
-        start[:_LEADING] = begun.trial.coefficients[:_LEADING]
-        start[prepared.forces.size :] = begun.trial.coefficients[_LEADING:]
-        return _after(begun, solver.solve(problem, start, begun.trial))
+        problem = self._problem(points, prepared, begun.trial)
+        start = np.zeros(problem.size)
+        start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
+        start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
+        return problem, _after(begun, solver.solve(problem, start, begun.trial))
 
     def _gathered(self, nodal: Floats) -> Prepared:
         """The unknown forces once more, where forces were found."""
@@ -246,6 +279,7 @@ class Registrar:
             trial=trial,
             forces=nodal,
             state=state,
+            correction=problem.correction(trial),
             pose=trial.pose or Pose.identity(),
             net_force=nodal.sum(axis=0),
             net_force_covariance=found.posterior.net_force_covariance(forces),
@@ -314,6 +348,10 @@ def expected_force(body: Body, young_modulus: float) -> float:
     return 0.01 * young_modulus * edge**2
 
 
+def _badness(result: Registration) -> tuple[int, float]:
+    return list(Verdict).index(result.judgement.verdict), result.noise
+
+
 def _after(first: Found, second: Found) -> Found:
     """The second result, with what the first took."""
     return replace(second, evaluations=first.evaluations + second.evaluations, trace=(*first.trace, *second.trace))
@@ -322,7 +360,7 @@ def _after(first: Found, second: Found) -> Found:
 def register_sequence(registrar: Registrar, clouds: Iterable[ArrayLike]) -> Iterator[Registration]:
     """Register clouds in their order, as they come; the caller may stop between any two.
 
-    A frame starts from the last one that was not refused.
+    A frame starts from the last one that was not refused: see `Registrar.follow`.
 
     Args:
         registrar: model, observed side, unknowns and options.
@@ -333,7 +371,7 @@ def register_sequence(registrar: Registrar, clouds: Iterable[ArrayLike]) -> Iter
     """
     last = None
     for cloud in clouds:
-        result = registrar.register(cloud, last)
+        result = registrar.follow(cloud, last)
         if result.judgement.is_usable:
             last = result
         yield result

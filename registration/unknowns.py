@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +13,7 @@ from scipy.spatial import cKDTree
 from softtwin.meshes.body import Body
 
 from .evidence import Scale
-from .forward import ForwardModel, reduce_model
+from .forward import Discrepancy, ForwardModel, reduce_model
 from .pose import Pose
 from .residuals import SurfaceDistance
 
@@ -225,3 +226,52 @@ class PosePrior:
     def pose(self, coefficients: Floats) -> Pose:
         """The pose for coefficients of unit variance, (6,)."""
         return self.mean.moved(self.deviations * coefficients, self.mean.apply(self.centre[None])[0])
+
+
+@dataclass(frozen=True, eq=False)
+class ModelError:
+    """What the forward model may get wrong, as unknowns of unit variance (Kennedy and O'Hagan 2001).
+
+    Args:
+        discrepancy: of the model, for a largest displacement of one metre.
+        observed: rows of its modes at the observed nodes, (3p, m).
+        size: largest displacement that is reckoned with, metres.
+    """
+
+    discrepancy: Discrepancy
+    observed: Floats
+    size: float
+
+    @classmethod
+    def of(cls, discrepancy: Discrepancy, nodes: Ints) -> ModelError:
+        """For a largest displacement of one metre.
+
+        Args:
+            discrepancy: of the model.
+            nodes: numbers of the observed nodes, (p,).
+        """
+        rows = (3 * nodes[:, None] + np.arange(3)).ravel()
+        return cls(discrepancy, np.ascontiguousarray(discrepancy.modes[rows]), 1.0)
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
+        return self.observed.shape[1]
+
+    @property
+    def rest(self) -> float:
+        """Standard deviation of a point's distance by what the modes leave out, metres."""
+        return self.size * self.discrepancy.rest
+
+    @cached_property
+    def modes(self) -> Floats:
+        """Change of the observed nodes by each unknown, (3p, m), metres."""
+        return self.size * self.observed
+
+    def field(self, coefficients: Floats) -> Floats:
+        """What is to be added to the model's displacement, (n, 3), metres."""
+        return (self.discrepancy.modes @ (self.size * coefficients)).reshape(-1, 3)
+
+    def observed_field(self, coefficients: Floats) -> Floats:
+        """The same at the observed nodes alone, (p, 3)."""
+        return (self.modes @ coefficients).reshape(-1, 3)

@@ -192,7 +192,7 @@ def _of_the_state(state: State, expected: Expectations) -> list[_Finding]:
 def _of_the_pose(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
     if problem.pose is None:
         return []
-    largest = float(np.abs(found.trial.coefficients[problem.forces.size :]).max())
+    largest = float(np.abs(found.trial.coefficients[problem.pose_part]).max())
     if largest <= expected.pose:
         return []
     return [

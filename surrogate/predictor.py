@@ -73,6 +73,7 @@ class Frame:
         left: of the linear response, (3n, r), m; r = 0 for none.
         right: of the linear response, (r, 3l), 1/N; None for the identity.
         spread: root mean square of each coordinate over the training loads, (d,); None where it was not measured.
+        error_modes: modes of `Discrepancy`, (3n, m); None where they were not measured.
     """
 
     loaded: Ints
@@ -82,6 +83,7 @@ class Frame:
     left: Floats
     right: Floats | None = None
     spread: Floats | None = None
+    error_modes: Floats | None = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What to store."""
@@ -100,6 +102,19 @@ class Frame:
         """Linear part of the gradient, (3l,), for a gradient with respect to the displacement, (3n,)."""
         row = cotangent @ self.left
         return row if self.right is None else row @ self.right
+
+
+@dataclass(frozen=True, eq=False)
+class Discrepancy:
+    """What a surrogate gets wrong, as a normal law: u - u* = size (modes a + rest), size the largest displacement.
+
+    Args:
+        modes: for a of unit variance, (3n, m), dimensionless.
+        rest: standard deviation of what they leave out in one component of a boundary node, dimensionless.
+    """
+
+    modes: Floats
+    rest: float
 
 
 def response_parts(response: LinearResponse) -> tuple[Floats, Floats | None]:
@@ -195,6 +210,12 @@ class Surrogate:
         """Largest error of a node over the body, mean of the held-out samples, metres; 0 where it was not measured."""
         held_out = self.card.get("held_out") or {}
         return float(held_out.get("largest_error", {}).get("mean", 0.0))
+
+    @cached_property
+    def discrepancy(self) -> Discrepancy | None:
+        """The errors of the validation samples as patterns; None where they were not measured."""
+        modes, rest = self.frame.error_modes, (self.card.get("discrepancy") or {}).get("rest")
+        return None if modes is None or rest is None else Discrepancy(modes, float(rest))
 
     def solve(self, forces: ArrayLike, near: Any = None) -> SurrogateState:
         """The state under nodal forces, (n, 3) newtons.

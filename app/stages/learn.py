@@ -10,6 +10,7 @@ import numpy as np
 
 from softtwin.meshes.metrics import nodal_distances
 from softtwin.reference.dataset import DataSet
+from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.predictor import Surrogate, load, save
@@ -45,7 +46,7 @@ def train_stage(space: Workspace, fresh: bool = False) -> Surrogate:
         seed=section.seed,
     )
     with timed(space, "train", train_inputs(space, data)):
-        surrogate = with_domain(train(data, plan, space.training), data)
+        surrogate = with_discrepancy(with_domain(train(data, plan, space.training), data), data)
         save(surrogate, space.twin)
         partial = space.twin / ".body.vtu.partial"
         shutil.copyfile(space.body, partial)

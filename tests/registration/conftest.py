@@ -52,6 +52,7 @@ class Cantilever:
         self._shape[body.fixed] = 0.0
 
     error = 0.0
+    discrepancy = None
 
     def solve(self, forces: ArrayLike, near: Any = None) -> CantileverState:
         mean = self._shape @ np.asarray(forces)

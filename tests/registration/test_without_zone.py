@@ -34,6 +34,7 @@ class Springs:
     """u = K^-1 f, K a sum of springs along the edges: forces act where they are, unlike in the cantilever."""
 
     error = 0.0
+    discrepancy = None
 
     def __init__(self, body: Body) -> None:
         self.body = body

@@ -1,0 +1,64 @@
+"""What a surrogate gets wrong, as patterns: the covariance of its errors on samples that it was not fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softtwin.reference.dataset import DataSet, Samples
+
+from .predictor import Surrogate
+
+Floats = NDArray[np.float64]
+_FOLDS = 4
+
+
+def relative_errors(surrogate: Surrogate, data: DataSet, samples: Samples) -> Floats:
+    """What is missing in the surrogate's displacement, in units of the largest displacement, (s, 3n).
+
+    Args:
+        surrogate: the surrogate.
+        data: the data set that the samples are of.
+        samples: loads and displacements.
+    """
+    forces = np.zeros_like(data.body.points)
+    missing = np.empty((len(samples), data.body.points.size))
+    for i, (loads, displacement) in enumerate(zip(samples.forces, samples.displacements, strict=True)):
+        forces[data.response.loaded] = loads
+        size = np.linalg.norm(displacement, axis=1).max()
+        missing[i] = (displacement - surrogate.solve(forces).displacement).ravel() / max(size, 1e-12)
+    return missing
+
+
+def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 64) -> Surrogate:
+    """The surrogate with the patterns of its errors on the validation samples: see `Discrepancy`.
+
+    What the patterns leave out is measured on samples that they were not made from.
+
+    Args:
+        surrogate: the surrogate.
+        data: the data set that it was trained on.
+        most: most patterns kept.
+    """
+    missing = relative_errors(surrogate, data, data.samples("validation"))
+    boundary = (3 * data.body.boundary_nodes[:, None] + np.arange(3)).ravel()
+    left_out = []
+    for fold in range(_FOLDS):
+        held = np.arange(len(missing)) * _FOLDS // len(missing) == fold  # whole paths: their samples are alike
+        modes = _modes(missing[~held], most)[0]
+        rest = missing[held] - (missing[held] @ modes) @ modes.T
+        left_out.append((rest[:, boundary] ** 2).mean(axis=1))
+    modes, sizes = _modes(missing, most)
+    frame = replace(surrogate.frame, error_modes=modes * sizes)
+    rest_size = float(np.sqrt(np.concatenate(left_out).mean()))
+    card = {**surrogate.card, "discrepancy": {"samples": len(missing), "rest": rest_size}}
+    return Surrogate(surrogate.body, frame, surrogate.core, card)
+
+
+def _modes(missing: Floats, most: int) -> tuple[Floats, Floats]:
+    """Orthonormal patterns, (3n, m), and the root mean square of the errors along each, (m,)."""
+    _, values, patterns = np.linalg.svd(missing, full_matrices=False)
+    kept = slice(0, most)
+    return np.ascontiguousarray(patterns[kept].T), values[kept] / np.sqrt(len(missing))

@@ -1,0 +1,142 @@
+"""A forward model that is wrong in known patterns: told from noise, put right, and part of the doubt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from softtwin.meshes.body import Body
+from softtwin.registration.evidence import Scale, linearised
+from softtwin.registration.forward import reduce_model
+from softtwin.registration.pose import Pose
+from softtwin.registration.problem import Problem, Trial
+from softtwin.registration.registrar import Registrar
+from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.unknowns import ModelError, PosePrior, nodal_forces
+
+from .conftest import Cantilever, cloud_on, tip_forces
+
+NET = (0.0, 0.3, -0.8)
+
+
+@dataclass(frozen=True, eq=False)
+class Patterns:
+    """Two smooth errors, of 5 % and 3 % of the largest displacement."""
+
+    modes: np.ndarray
+    rest: float = 1e-3
+
+
+def patterns(body: Body) -> Patterns:
+    x = body.points[:, 0] / body.points[:, 0].max()
+    modes = np.zeros((*body.points.shape, 2))
+    modes[:, 2, 0], modes[:, 1, 1] = 0.05 * np.sin(np.pi * x), 0.03 * x * (1.0 - x) * 4.0
+    modes[body.fixed] = 0.0
+    return Patterns(modes.reshape(-1, 2))
+
+
+class Biased(Cantilever):
+    """The test model, which knows by what patterns it may be wrong."""
+
+    def __init__(self, body: Body, known: bool = True) -> None:
+        super().__init__(body)
+        self.error = 0.005
+        self.discrepancy = patterns(body) if known else None
+
+
+def true_displacement(body: Body, a: np.ndarray) -> np.ndarray:
+    u = Cantilever(body).solve(tip_forces(body, NET)).displacement
+    size = np.linalg.norm(u, axis=1).max()
+    return u + size * (patterns(body).modes @ a).reshape(-1, 3)
+
+
+def registrar(body: Body, known: bool = True) -> Registrar:
+    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 0.5, least=1e-4))
+    return Registrar(Biased(body, known), SurfaceDistance(body, body.surfaces["observed"]), forces)
+
+
+def test_an_error_of_known_shape_is_put_right(body: Body, rng) -> None:
+    truth = true_displacement(body, np.array([1.0, -1.0]))
+    cloud = cloud_on(body, truth, 400, rng, 5e-4)
+    plain, known = registrar(body, known=False).register(cloud), registrar(body).register(cloud)
+    missed = [np.linalg.norm(r.displacement - truth, axis=1)[body.boundary_nodes].mean() for r in (plain, known)]
+    assert missed[1] < 0.3 * missed[0]
+    assert known.noise == pytest.approx(5e-4, rel=0.3)
+    assert np.abs(known.correction).max() > 1e-3
+    np.testing.assert_array_equal(known.correction[body.fixed], 0.0)
+    np.testing.assert_array_equal(known.displacement, known.state.displacement + known.correction)
+
+
+def test_doubt_of_the_net_force_knows_of_the_models_error(body: Body) -> None:
+    """Errors drawn from their own law: z^2 = e' S^-1 e / 2 has a mean near 1; with noise alone it is far above."""
+    made = registrar(body)
+    scores, blind = [], []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        cloud = cloud_on(body, true_displacement(body, rng.standard_normal(2)), 200, rng, 5e-4)
+        result = made.register(cloud)
+        missed = (result.net_force - NET)[1:]
+        scores.append(missed @ np.linalg.solve(result.net_force_covariance[1:, 1:], missed) / 2.0)
+        exact = Registrar(Cantilever(body), made.observed, made.forces).register(cloud)
+        missed = (exact.net_force - NET)[1:]
+        blind.append(missed @ np.linalg.solve(exact.net_force_covariance[1:, 1:], missed) / 2.0)
+    assert 0.3 < np.mean(scores) < 2.0
+    assert np.mean(blind) > 2.0 * np.mean(scores)
+
+
+def test_the_next_frame_starts_from_the_error_found(body: Body, rng) -> None:
+    truth = true_displacement(body, np.array([1.0, -1.0]))
+    made = registrar(body)
+    cold = made.register(cloud_on(body, truth, 400, rng, 5e-4))
+    warm = made.register(cloud_on(body, truth, 400, rng, 5e-4), cold)
+    assert warm.judgement.is_usable and warm.evaluations < cold.evaluations
+    assert np.linalg.norm(warm.correction - cold.correction, axis=1).max() < 2e-3
+
+
+def test_the_derivative_of_the_distances_is_exact(body: Body, rng) -> None:
+    """By central differences, with forces, pose and model error at once; the adjoint gives the same."""
+    model, observed = Biased(body), SurfaceDistance(body, body.surfaces["observed"])
+    forces = nodal_forces(body, body.node_sets["tip"][:4], Scale(0.05, 0.5))
+    prior = PosePrior(Pose.identity(), body.points.mean(axis=0))
+    error = replace(ModelError.of(model.discrepancy, observed.nodes), size=0.1)
+    cloud = cloud_on(body, true_displacement(body, np.array([1.0, -1.0])), 100, rng, 5e-3)
+    reduced = reduce_model(model, observed.nodes, forces.basis)
+    problem = Problem(reduced, observed, forces, prior, cloud, Scale(1e-3, 1.0), error)
+    at = 0.1 * rng.standard_normal(problem.size)
+    trial, direction, step = problem.trial(at), rng.standard_normal(problem.size), 1e-6
+    assert problem.size == forces.size + 6 + 2
+
+    def near(sign: float) -> Trial:
+        return problem.trial(at + sign * step * direction, trial)
+
+    ahead, behind = near(1.0), near(-1.0)
+    stays = (ahead.match.triangles == trial.match.triangles) & (behind.match.triangles == trial.match.triangles)
+    jacobian = problem.jacobian(trial)
+    differences = (ahead.match.distances - behind.match.distances) / (2.0 * step)
+    assert stays.mean() > 0.9
+    np.testing.assert_allclose((jacobian @ direction)[stays], differences[stays], rtol=1e-4, atol=1e-7)
+    cotangent = rng.standard_normal(len(cloud))
+    np.testing.assert_allclose(problem.pulled(trial, cotangent), jacobian.T @ cotangent, rtol=1e-8, atol=1e-10)
+
+
+def test_unknowns_beside_are_integrated_out(rng) -> None:
+    """The information on the others is J^T (W^-1 + N N^T / sigma^2)^-1 J; without variance it is J^T W J."""
+    jacobian, beside = rng.standard_normal((50, 4)), rng.standard_normal((50, 3))
+    residuals, weights, noise = rng.standard_normal(50), rng.uniform(0.2, 1.0, 50), 0.7
+    at, values = rng.standard_normal(4), rng.standard_normal(3)
+    found = linearised(jacobian, residuals, weights, at, 1.0, noise, (beside, values))
+    precision = np.linalg.inv(np.diag(1.0 / weights) + beside @ beside.T / noise**2)
+    data = jacobian @ at + beside @ values - residuals
+    np.testing.assert_allclose(
+        found.vectors @ np.diag(found.information) @ found.vectors.T, jacobian.T @ precision @ jacobian, rtol=1e-9
+    )
+    np.testing.assert_allclose(found.vectors @ found.projections, jacobian.T @ precision @ data, rtol=1e-9)
+    best = np.linalg.solve(jacobian.T @ precision @ jacobian, jacobian.T @ precision @ data)
+    rest = data - jacobian @ best
+    assert found.rest == pytest.approx(rest @ precision @ rest)
+    alone = linearised(jacobian, residuals, weights, at, 1.0)
+    without = linearised(jacobian, residuals, weights, at, 1.0, noise, (np.zeros((50, 3)), values))
+    np.testing.assert_allclose(alone.information, without.information)
+    assert alone.rest == pytest.approx(without.rest)

@@ -1,0 +1,40 @@
+"""Patterns of a surrogate's errors: what they hold of errors that they were not made from, and that twins keep them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from softtwin.reference.dataset import DataSet
+from softtwin.surrogate.discrepancy import relative_errors, with_discrepancy
+from softtwin.surrogate.predictor import Surrogate, load, save
+
+
+def test_patterns_hold_most_of_held_out_errors(reduced: Surrogate, data: DataSet) -> None:
+    known = with_discrepancy(reduced, data)
+    assert reduced.discrepancy is None
+    modes = known.discrepancy.modes
+    missing = relative_errors(known, data, data.samples("test"))
+    basis = np.linalg.qr(modes)[0]
+    rest = missing - (missing @ basis) @ basis.T
+    assert (rest**2).sum() < 0.3 * (missing**2).sum()
+    assert np.abs(modes.reshape(*known.body.points.shape, -1)[known.body.fixed]).max() < 1e-12
+    assert 0.0 < known.discrepancy.rest < np.sqrt((missing**2).mean())
+
+
+def test_their_size_is_that_of_the_errors(reduced: Surrogate, data: DataSet) -> None:
+    """The covariance of the patterns has the trace of the validation errors, as far as it is not cut off."""
+    missing = relative_errors(reduced, data, data.samples("validation"))
+    every = with_discrepancy(reduced, data, most=len(missing)).discrepancy
+    few = with_discrepancy(reduced, data, most=2).discrepancy
+    np.testing.assert_allclose((every.modes**2).sum(), (missing**2).sum() / len(missing))
+    assert few.modes.shape[1] == 2 and few.rest > every.rest
+
+
+def test_a_saved_twin_keeps_them(reduced: Surrogate, data: DataSet, tmp_path: Path) -> None:
+    known = with_discrepancy(reduced, data, most=3)
+    save(known, tmp_path)
+    again = load(tmp_path, known.body).discrepancy
+    np.testing.assert_array_equal(again.modes, known.discrepancy.modes)
+    assert again.rest == known.discrepancy.rest
