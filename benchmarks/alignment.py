@@ -27,7 +27,7 @@ from softtwin.meshes.body import Surface
 from softtwin.meshes.clouds import visible_triangles
 from softtwin.meshes.shapes import liver_phantom
 from softtwin.registration.pose import Pose, from_landmarks
-from softtwin.registration.rigid import Alignment, Outcome, align
+from softtwin.registration.rigid import Alignment, AlignmentOutcome, align
 
 Floats = NDArray[np.float64]
 SHARES = (0.50, 0.25, 0.08)
@@ -100,7 +100,7 @@ def of_liver(surface: Surface, views: list[View], clouds: list[Floats]) -> dict[
 
 def outcomes(alignments: list[Alignment]) -> dict[str, int]:
     """How often each outcome came."""
-    return {outcome.value: sum(a.outcome is outcome for a in alignments) for outcome in Outcome}
+    return {outcome.value: sum(a.outcome is outcome for a in alignments) for outcome in AlignmentOutcome}
 
 
 def impossible(draw: Callable[[np.random.Generator], Floats], surface: Surface, draws: int) -> dict[str, Any]:

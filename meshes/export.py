@@ -22,7 +22,7 @@ from .body import Floats, Ints, Surface
 from .files import FileError, Frame, Unit
 
 SURFACE_FORMATS = ("stl", "ply", "vtp")
-_PER_METRE: Mapping[str, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+PER_METRE: Mapping[str, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 _TURN: Mapping[str, Floats] = {"lps": np.ones(3), "ras": np.array([-1.0, -1.0, 1.0])}
 
 
@@ -39,12 +39,12 @@ class Coordinates:
     axes: Frame = "lps"
 
     def __post_init__(self) -> None:
-        if self.unit not in _PER_METRE or self.axes not in _TURN:
+        if self.unit not in PER_METRE or self.axes not in _TURN:
             raise ValueError(f"Coordinates: expected m, cm or mm and lps or ras, got {self.unit!r} and {self.axes!r}.")
 
     def lengths(self, vectors: ArrayLike) -> Floats:
         """Points or displacements in these coordinates, (..., 3), from metres and LPS."""
-        return _PER_METRE[self.unit] * self.directions(vectors)
+        return PER_METRE[self.unit] * self.directions(vectors)
 
     def directions(self, vectors: ArrayLike) -> Floats:
         """Vectors of another unit (forces) on these axes, (..., 3)."""
@@ -52,7 +52,7 @@ class Coordinates:
 
     def metres(self, lengths: ArrayLike) -> Floats:
         """Points or displacements in metres and LPS, (..., 3), from these coordinates."""
-        return _TURN[self.axes] * np.asarray(lengths, dtype=np.float64) / _PER_METRE[self.unit]
+        return _TURN[self.axes] * np.asarray(lengths, dtype=np.float64) / PER_METRE[self.unit]
 
     def motion(self, matrix: ArrayLike) -> Floats:
         """A rigid motion of metres and LPS as one of these axes, in metres, (4, 4); and back: it is its own inverse."""

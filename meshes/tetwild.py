@@ -66,8 +66,8 @@ def tetrahedra(surface: Surface, edge_length: float, tolerance: float) -> tuple[
 def _run(program: list[str], folder: str) -> tuple[int, str]:
     """Code and error output of a program that runs in a folder, with a clock on a terminal; it dies with its caller."""
     clock = tqdm(desc="making the surface solid", bar_format="{desc} {elapsed}", disable=None, leave=False)
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    with clock, subprocess.Popen(program, text=True, cwd=folder, **quiet) as run:
+    silent, pipe = subprocess.DEVNULL, subprocess.PIPE
+    with clock, subprocess.Popen(program, text=True, cwd=folder, stdout=silent, stderr=pipe) as run:
         errors = None
         try:
             while errors is None:

@@ -91,6 +91,7 @@ def linearised(
     consistency: float,
     noise: float = 1.0,
     beside: tuple[Floats, Floats] | None = None,
+    shares: Floats | None = None,
 ) -> Linearised:
     """The linear problem about a state.
 
@@ -105,8 +106,9 @@ def linearised(
         consistency: of the loss that gave the weights.
         noise: standard deviation of a point's distance so far, metres.
         beside: N, derivative of the residuals by unknowns of unit variance, (p, q), and their values, (q,).
+        shares: part of the variance of each point's distance that is its noise so far, (p,); all of it if not given.
     """
-    root = np.sqrt(weights)
+    root = np.sqrt(weights if shares is None else weights * shares)
     inner = root[:, None] * jacobian
     data = root * (jacobian @ coefficients - residuals)
     matrix, pulled, square = inner.T @ inner, inner.T @ data, float(data @ data)

@@ -50,8 +50,8 @@ class Discrepancy(Protocol):
         """Patterns of the error over the body for a largest displacement of one metre, (3n, m)."""
 
     @property
-    def rest(self) -> float:
-        """Standard deviation of a component of what they leave out, for the same displacement."""
+    def rest(self) -> Floats:
+        """Standard deviation of what they leave out in a component of each node, (n,), for the same displacement."""
 
 
 class ForwardModel(Protocol):
@@ -102,6 +102,13 @@ class ReducedState(Protocol):
 class ReducedModel(Protocol):
     """A forward model between the coefficients of a force basis and chosen nodes."""
 
+    @property
+    def count(self) -> int:
+        """Number of coefficients, k."""
+
+    def combined(self, matrix: Floats) -> ReducedModel:
+        """The same model for the basis times a matrix, (k, j): without going through the whole body again."""
+
     def solve(self, coefficients: Floats, near: Any = None) -> ReducedState:
         """The state for coefficients (k,)."""
 
@@ -135,6 +142,13 @@ class _PickedModel:
     def __init__(self, model: ForwardModel, nodes: Ints, basis: Floats) -> None:
         self.model, self.nodes, self.basis = model, nodes, basis
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
+
+    @property
+    def count(self) -> int:
+        return self.basis.shape[1]
+
+    def combined(self, matrix: Floats) -> _PickedModel:
+        return _PickedModel(self.model, self.nodes, self.basis @ matrix)
 
     def solve(self, coefficients: Floats, near: _PickedState | None = None) -> _PickedState:
         if near is not None and np.array_equal(near.coefficients, coefficients):

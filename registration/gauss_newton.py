@@ -18,6 +18,7 @@ from .posterior import Posterior, posterior
 from .problem import Problem, Trial
 
 Floats = NDArray[np.float64]
+_ROUGH = 15  # iterations that a start is worth
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,12 @@ class GaussNewton:
 
     def rough(self) -> GaussNewton:
         """The same with the first loss alone, ended early: for a start."""
-        return replace(self, losses=self.losses[:1], settled=self.handed_on)
+        few = min(self.max_iterations, _ROUGH)
+        return replace(self, losses=self.losses[:1], settled=self.handed_on, max_iterations=few)
+
+    def without_steps(self) -> GaussNewton:
+        """The same, which takes any start for the end: to judge it."""
+        return replace(self, losses=self.losses[:1], settled=1e9, handed_on=1e9, graduation=0.0)
 
     def solve(self, problem: Problem, start: Floats, near: Trial | None = None) -> Found:
         """The coefficients that minimise the robust distance plus the prior.
@@ -121,7 +127,7 @@ class _Search:
 
     def __init__(self, options: GaussNewton, problem: Problem, start: Floats, near: Trial | None) -> None:
         self.options, self.problem = options, problem
-        self.trial = problem.trial(start, near, anew=near is None or near.cloud is not problem.cloud)
+        self.trial = _begun(problem, start, near)
         self.evaluations, self.limit = 1, options.max_step
         self.noise = max(robust_deviation(self.trial.match.distances), problem.noise.least)
         self.trace: list[Step] = []
@@ -182,6 +188,13 @@ class _Search:
         return Outcome.REFUSED if unsolved else Outcome.NO_DESCENT
 
 
+def _begun(problem: Problem, start: Floats, near: Trial | None) -> Trial:
+    """The trial at the start: the one given, where it is of this cloud and has just these coefficients."""
+    if near is None or near.cloud is not problem.cloud:
+        return problem.trial(start, near, anew=True)
+    return near if near.coefficients is start else problem.trial(start, near)
+
+
 def _next_limit(limit: float, taken: float, gain: float) -> float:
     if gain <= 0.0:
         return min(limit, taken) / 3.0
@@ -203,27 +216,29 @@ class LocalModel:
 
     def __init__(self, problem: Problem, trial: Trial, loss: Loss, noise: float, graduation: float = 0.0) -> None:
         self.problem, self.trial = problem, trial
-        distances = trial.match.distances
+        distances, left_out = trial.match.distances, problem.left_out(trial)
         self.jacobian = problem.jacobian(trial)
-        weights = loss.weight(distances / noise)
-        self.scales, self.is_graduated = self._found_scales(loss, weights, noise, graduation)
+        self.scales, self.is_graduated = self._found_scales(loss, noise, left_out, graduation)
         self.noise = self.scales.noise
-        self.weights = loss.weight(distances / self.noise)
+        self.deviations = np.hypot(self.noise, left_out)
+        self.weights = loss.weight(distances / self.deviations)
         self.precision = np.ones(problem.size)
         self.precision[problem.force_part] = 1.0 / self.scales.force**2
-        self.information = self.jacobian.T @ (weights[:, None] * self.jacobian)
-        self._hessian = self.information / self.noise**2 + np.diag(self.precision)
-        self.gradient = self.jacobian.T @ (self.weights * distances) / self.noise**2
-        self.gradient += self.precision * trial.coefficients
+        trust = self.weights / self.deviations**2
+        self.information = self.jacobian.T @ (trust[:, None] * self.jacobian)
+        self._hessian = self.information + np.diag(self.precision)
+        self.gradient = self.jacobian.T @ (trust * distances) + self.precision * trial.coefficients
         self.value = self.objective(trial, loss)
 
-    def _found_scales(self, loss: Loss, weights: Floats, noise: float, graduation: float) -> tuple[Scales, bool]:
+    def _found_scales(self, loss: Loss, noise: float, left_out: Floats, graduation: float) -> tuple[Scales, bool]:
         """Scales, and whether the noise is held above what the linear model alone would believe."""
         problem, part = self.problem, self.problem.force_part
         beside = self.jacobian[:, part.stop :], self.trial.coefficients[part.stop :]
         coefficients, residuals = self.trial.coefficients[part], self.trial.match.distances
+        deviations = np.hypot(noise, left_out)
+        weights, shares = loss.weight(residuals / deviations), (noise / deviations) ** 2
         jacobian = self.jacobian[:, part]
-        local = linearised(jacobian, residuals, weights, coefficients, loss.consistency, noise, beside)
+        local = linearised(jacobian, residuals, weights, coefficients, loss.consistency, noise, beside, shares)
         scales = find_scales(local, problem.noise, problem.forces.scale)
         least = graduation * local.promised(scales, coefficients)
         if least <= scales.noise:
@@ -251,7 +266,7 @@ class LocalModel:
     def objective(self, trial: Trial, loss: Loss) -> float:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ trial.coefficients**2)
-        return float(loss.value(trial.match.distances / self.noise).sum()) + prior
+        return float(loss.value(trial.match.distances / self.deviations).sum()) + prior
 
     @property
     def length(self) -> float:

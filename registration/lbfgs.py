@@ -10,7 +10,6 @@ from scipy.optimize import minimize
 
 from softtwin.reference.outcome import NotConverged
 
-from .evidence import Scales
 from .gauss_newton import Found, LocalModel, Step
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
@@ -48,6 +47,10 @@ class LBFGS:
         """The same with the first loss alone: for a start."""
         return replace(self, losses=self.losses[:1])
 
+    def without_steps(self) -> LBFGS:
+        """The same with one short run: to judge a start."""
+        return replace(self, losses=self.losses[:1], max_iterations=1)
+
     def solve(self, problem: Problem, start: Floats, near: Trial | None = None) -> Found:
         """The coefficients that minimise the robust distance plus the prior.
 
@@ -74,13 +77,13 @@ class _Run:
         for loss in self.options.losses:
             local = LocalModel(self.problem, self.trial, loss, noise)
             noise = local.noise
-            outcome = self._descend(loss, local.scales, noise)
+            outcome = self._descend(loss, local)
         local = LocalModel(self.problem, self.trial, self.options.losses[-1], noise)
         return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
 
-    def _descend(self, loss: Loss, scales: Scales, noise: float) -> Outcome:
+    def _descend(self, loss: Loss, local: LocalModel) -> Outcome:
         """One run at fixed scales, in coefficients of unit prior variance."""
-        problem = self.problem
+        problem, scales = self.problem, local.scales
         root = np.ones(problem.size)
         root[problem.force_part] = scales.force
         least = np.inf
@@ -94,7 +97,7 @@ class _Run:
             except NotConverged:  # a wall that the line search steps back from
                 met_wall = True
                 return _WALL * max(least, 1.0), np.zeros_like(scaled)
-            value, gradient = _objective(problem, trial, loss, noise)
+            value, gradient = _objective(problem, trial, loss, local.deviations)
             value += 0.5 * float(scaled @ scaled)
             if value < least:
                 least, self.best = value, trial
@@ -104,7 +107,9 @@ class _Run:
         done = minimize(evaluate, self.trial.coefficients / root, jac=True, method="L-BFGS-B", options=limits)
         moved = float(problem.moved(self.trial, self.best.coefficients - self.trial.coefficients).max())
         self.trial = self.best
-        self.trace.append(Step(self.trial.match.rms, least, noise, scales.force, moved, float("nan"), float("nan")))
+        self.trace.append(
+            Step(self.trial.match.rms, least, scales.noise, scales.force, moved, float("nan"), float("nan"))
+        )
         if done.success:
             return Outcome.CONVERGED
         if done.status == 1:
@@ -112,8 +117,8 @@ class _Run:
         return Outcome.REFUSED if met_wall else Outcome.NO_DESCENT
 
 
-def _objective(problem: Problem, trial: Trial, loss: Loss, noise: float) -> tuple[float, Floats]:
+def _objective(problem: Problem, trial: Trial, loss: Loss, deviations: Floats) -> tuple[float, Floats]:
     """Robust distances and their gradient by the coefficients, (k,)."""
-    scaled = trial.match.distances / noise
-    slope = loss.weight(scaled) * scaled / noise
+    scaled = trial.match.distances / deviations
+    slope = loss.weight(scaled) * scaled / deviations
     return float(loss.value(scaled).sum()), problem.pulled(trial, slope)

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from softtwin.meshes.export import PER_METRE
 from softtwin.meshes.files import FileError, Frame, Unit
 
 Floats = NDArray[np.float64]
 
-_PER_METRE: Mapping[str, int] = {"m": 1, "cm": 100, "mm": 1000}
 _ORTHOGONAL = 1e-3  # how far R R^T may be from one: matrices come typed by hand with four digits
 _FLAT = 1e-2  # landmarks are in a line when their second extent is below this part of the first
 _TURN = np.array([-1.0, -1.0, 1.0])  # from RAS to LPS and back
@@ -213,10 +213,10 @@ def _existing(path: str | Path) -> Path:
     return path
 
 
-def _per_metre(unit: str) -> int:
-    if unit not in _PER_METRE:
-        raise FileError(f"unit: expected one of {', '.join(_PER_METRE)}, got {unit!r}.")
-    return _PER_METRE[unit]
+def _per_metre(unit: str) -> float:
+    if unit not in PER_METRE:
+        raise FileError(f"unit: expected one of {', '.join(PER_METRE)}, got {unit!r}.")
+    return PER_METRE[unit]
 
 
 def _table(path: Path) -> Any:

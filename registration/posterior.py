@@ -37,14 +37,13 @@ class Posterior:
 
 
 def posterior(information: Floats, precision: Floats, mean: Floats, scales: Scales) -> Posterior:
-    """The posterior for the information J^T W J of unit noise, (k, k), and the prior's precision, (k,).
+    """The posterior for the information of the points, (k, k), and the prior's precision, (k,).
 
     Args:
-        information: of the points, 1/m^2 per squared unit of the coefficients.
+        information: J^T W J with the weights over the variances, per squared unit of the coefficients.
         precision: of the prior, (k,).
         mean: the coefficients found, (k,).
         scales: noise and force scale.
     """
-    seen = information / scales.noise**2
-    covariance = np.linalg.inv(seen + np.diag(precision))
-    return Posterior(mean, covariance, scales, float(np.einsum("ij,ji->", covariance, seen)))
+    covariance = np.linalg.inv(information + np.diag(precision))
+    return Posterior(mean, covariance, scales, float(np.einsum("ij,ji->", covariance, information)))

@@ -106,6 +106,13 @@ class Problem:
             return np.zeros_like(self.observed.body.points)
         return self.error.field(trial.coefficients[self.error_part])
 
+    def left_out(self, trial: Trial) -> Floats:
+        """Standard deviation of each distance by what the patterns of the model's error leave out, (p,), metres."""
+        if self.error is None:
+            return np.zeros(len(self.cloud))
+        corners = self.error.rest[self.observed.triangles[trial.match.triangles]]
+        return np.einsum("pk,pk->p", trial.match.weights, corners)
+
     def again(self, trial: Trial) -> Trial:
         """The same trial with its closest points searched anew."""
         return replace(trial, match=self.observed.match(trial.positions, trial.cloud))

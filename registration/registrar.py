@@ -19,18 +19,24 @@ from .evidence import Scale
 from .forward import ForwardModel, ReducedModel, State, reduce_model
 from .gauss_newton import Found, GaussNewton, Step
 from .lbfgs import LBFGS
+from .loss import robust_deviation
 from .outcome import Outcome
 from .pose import Pose
 from .problem import Problem, Trial
 from .residuals import SurfaceDistance
 from .thinning import thinned
-from .unknowns import Forces, Informed, ModelError, PosePrior, contact, informed, nodal_forces, windowed
+from .unknowns import Forces, Informed, ModelError, PosePrior, contact, nodal_forces, told, windowed
 from .verdict import Expectations, Judgement, Verdict, judge
 
 Floats = NDArray[np.float64]
 # Of the logarithm of a nodal force. A model with an error of its own must not explain that by forces.
 EXACT_SPREAD, LEARNED_SPREAD = 1.0, 0.5
+_FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _LEFT = 1.5  # times the noise of the frame before
+_DOUBTS, _SURE = 3, 0.25  # times that the model's error is scaled anew; not where that changes it by less
+_BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
+_LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
+_HOPELESS = 1.25  # times the largest noise expected: no more time is spent
 _LEADING = 6  # directions of force that a cold start begins with
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
 
@@ -77,6 +83,15 @@ class Prepared:
         """What can be multiplied before a cloud comes."""
         return cls(forces, reduce_model(model, observed.nodes, forces.basis))
 
+    def informed(self, observed: SurfaceDistance, rule: Informed) -> Prepared:
+        """The directions that a cloud can tell: see `unknowns.told`."""
+        kept = told(self.model, observed, rule)
+        return Prepared(self.forces.combined(kept), self.model.combined(kept))
+
+    def leading(self, count: int) -> Prepared:
+        """The first directions alone."""
+        return Prepared(self.forces.leading(count), self.model.combined(np.eye(self.forces.size)[:, :count]))
+
 
 @dataclass(frozen=True, eq=False)
 class Registration:
@@ -88,6 +103,7 @@ class Registration:
         forces: nodal forces, (n, 3), newtons.
         state: the body's state as the model has it, with its derivatives.
         correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres.
+        doubt: how large the model's error was found, in units of its samples'; 1 where it is not known in patterns.
         pose: from the body's coordinates to the cloud's.
         net_force: (3,), newtons.
         net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
@@ -109,6 +125,7 @@ class Registration:
     forces: Floats
     state: State
     correction: Floats
+    doubt: float
     pose: Pose
     net_force: Floats
     net_force_covariance: Floats
@@ -170,7 +187,6 @@ class Registrar:
         self.noise = self.options.noise.at_least(model.error)
         self.expectations = expectations or Expectations.of(model, self.noise)
         self._everywhere = Prepared.of(model, observed, forces)
-        self._leading = Prepared.of(model, observed, forces.leading(_LEADING))
 
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud.
@@ -187,9 +203,14 @@ class Registrar:
         points = self._checked(cloud)
         if start is None:
             return self._cold(points, begin)
-        problem = self._problem(points, start.prepared, start.trial)
-        found = self.options.solver.solve(problem, start.trial.coefficients, start.trial)
-        result = self._result(problem, found, start.prepared, begin)
+        problem = self._problem(points, start.prepared, start.trial, start.doubt)
+        near = problem.trial(start.trial.coefficients.copy(), start.trial, anew=True)
+        if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
+            problem, found = self._from_rest(points, start.prepared)
+        else:
+            found = self.options.solver.solve(problem, near.coefficients, near)
+        problem, found, doubt = self._doubted(problem, found, start.doubt)
+        result = self._result(problem, found, start.prepared, begin, doubt)
         if self.options.rounds and self._has_left(result, start):
             return self._cold(points, begin)
         return result
@@ -216,44 +237,83 @@ class Registrar:
             return warm
         return min(warm, self.register(cloud), key=_badness)
 
-    def _problem(self, points: Floats, prepared: Prepared, near: Trial | None = None) -> Problem:
+    def _problem(self, points: Floats, prepared: Prepared, near: Trial | None = None, doubt: float = 1.0) -> Problem:
         """The problem; near a trial, whose size says how large the model's error may be, with it in patterns."""
         plain = Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.noise)
         if self.error is None or near is None:
             return plain
         moved = np.linalg.norm(near.positions, axis=1).max() + near.match.rms
-        error = replace(self.error, size=float(moved))
-        return replace(plain, error=error, noise=self.options.noise.at_least(error.rest))
+        error = replace(self.error, size=doubt * float(moved))
+        return replace(plain, error=error, noise=self.options.noise)
 
     def _cold(self, points: Floats, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more from rest for each round of gathering them."""
         prepared = self._everywhere
-        problem, found = self._from_rest(points, prepared, self._leading)
+        problem, found = self._from_rest(points, prepared)
         for _ in range(self.options.rounds):
+            if self._is_hopeless(found):
+                break
             prepared = self._gathered(prepared.forces.forces(found.trial.coefficients[problem.force_part]))
             spent = found
             problem, found = self._from_rest(points, prepared)
             found = _after(spent, found)
-        return self._result(problem, found, prepared, begin)
+        problem, found, doubt = self._doubted(problem, found, 1.0)
+        return self._result(problem, found, prepared, begin, doubt)
 
-    def _from_rest(self, points: Floats, prepared: Prepared, leading: Prepared | None = None) -> tuple[Problem, Found]:
+    def _from_rest(self, points: Floats, prepared: Prepared) -> tuple[Problem, Found]:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
         solver = self.options.solver
-        first = leading or Prepared.of(self.model, self.observed, prepared.forces.leading(_LEADING))
+        first = prepared.leading(_LEADING)
         rough = self._problem(points, first)
         begun = solver.rough().solve(rough, np.zeros(rough.size))
         problem = self._problem(points, prepared, begun.trial)
         start = np.zeros(problem.size)
         start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
         start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
+        if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
+            solver = solver.without_steps()
         return problem, _after(begun, solver.solve(problem, start, begun.trial))
+
+    def _is_hopeless(self, found: Found) -> bool:
+        return found.posterior.scales.noise > _HOPELESS * self.expectations.noise
+
+    def _doubted(self, problem: Problem, found: Found, doubt: float) -> tuple[Problem, Found, float]:
+        """Once more where the model's error is larger or smaller than its samples said: its scale is found, too.
+
+        The scale is MacKay's (1992): the squares of the unknowns over the number that the cloud tells of them.
+        """
+        for _ in range(_DOUBTS):
+            if problem.error is None:
+                break
+            unknown = found.trial.coefficients[problem.error_part]
+            variances = np.diag(found.posterior.covariance)[problem.error_part]
+            known = len(unknown) - float(variances.sum())
+            factor = float(np.sqrt((unknown @ unknown + _BELIEF) / (known + _BELIEF)))
+            factor = min(max(factor, _LEAST_DOUBT / doubt), _MOST_DOUBT / doubt)
+            if abs(np.log(factor)) < _SURE:
+                break
+            doubt *= factor
+            problem = replace(problem, error=replace(problem.error, size=factor * problem.error.size))
+            start = found.trial.coefficients.copy()
+            start[problem.error_part] /= factor
+            again = self.options.solver.solve(problem, start, found.trial)
+            found = _after(found, again)
+        return problem, found, doubt
 
     def _gathered(self, nodal: Floats) -> Prepared:
         """The unknown forces once more, where forces were found."""
         body = self.model.body
         where = contact(self.forces, nodal, body.points, self.options.reach * body.size)
-        forces = informed(windowed(self.forces, where), self.model, self.observed, self.options.informed)
-        return Prepared.of(self.model, self.observed, forces)
+        every = Prepared.of(self.model, self.observed, windowed(self.forces, where))
+        return every.informed(self.observed, self.options.informed)
+
+    def _is_nearer_at_rest(self, near: Trial, start: Registration) -> bool:
+        """True where a cloud lies nearer to the body at rest than to what the last frame has found."""
+        far = robust_deviation(near.match.distances)
+        if far < _FAR * max(start.noise, self.options.noise.least):
+            return False
+        rest = self.observed.match(np.zeros_like(near.positions), near.cloud)
+        return robust_deviation(rest.distances) < far
 
     def _has_left(self, result: Registration, start: Registration) -> bool:
         """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
@@ -269,7 +329,7 @@ class Registrar:
             return points
         return check_cloud(points, self.model.body)
 
-    def _result(self, problem: Problem, found: Found, prepared: Prepared, begin: float) -> Registration:
+    def _result(self, problem: Problem, found: Found, prepared: Prepared, begin: float, doubt: float) -> Registration:
         trial, forces = found.trial, prepared.forces
         inner = trial.coefficients[problem.force_part]
         nodal = forces.forces(inner)
@@ -280,6 +340,7 @@ class Registrar:
             forces=nodal,
             state=state,
             correction=problem.correction(trial),
+            doubt=doubt,
             pose=trial.pose or Pose.identity(),
             net_force=nodal.sum(axis=0),
             net_force_covariance=found.posterior.net_force_covariance(forces),
@@ -329,7 +390,8 @@ def prepare(
     scale = Scale(force_scale, spread, least=1e-2 * force_scale)
     every = nodal_forces(model.body, nodes, scale, smoothness)
     rule = Informed(options.noise.least, scale=10.0 * force_scale, most=directions)
-    return Registrar(model, observed, informed(every, model, observed, rule), options, pose=pose)
+    forces = Prepared.of(model, observed, every).informed(observed, rule).forces
+    return Registrar(model, observed, forces, options, pose=pose)
 
 
 def rounds_for(model: ForwardModel, has_zone: bool) -> int:

@@ -44,7 +44,7 @@ _FLOOR = 1e-3  # of a misfit: points 1 mm off a liver, what samples of the surfa
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
-class Outcome(Enum):
+class AlignmentOutcome(Enum):
     """How a search for a pose ended, and what to do about it."""
 
     FOUND = "found"
@@ -59,12 +59,12 @@ class Outcome(Enum):
 
 
 _ADVICE = {
-    Outcome.FOUND: "The pose is good to one or two centimetres: refine it together with the organ's deformation.",
-    Outcome.AMBIGUOUS: "Other poses, or the mirror image of the cloud, fit as well: show more of the organ, "
+    AlignmentOutcome.FOUND: "The pose is good to one or two centimetres: refine it with the organ's deformation.",
+    AlignmentOutcome.AMBIGUOUS: "Other poses, or the mirror image of the cloud, fit as well: show more of the organ, "
     "its edges above all, or give landmarks or a start matrix.",
-    Outcome.MIRRORED: "The mirror image of the cloud fits the organ better than the cloud: "
+    AlignmentOutcome.MIRRORED: "The mirror image of the cloud fits the organ better than the cloud: "
     "check the signs and the order of its axes.",
-    Outcome.NO_MATCH: "No pose explains the cloud: check its unit, that it shows this organ and little else, "
+    AlignmentOutcome.NO_MATCH: "No pose explains the cloud: check its unit, that it shows this organ and little else, "
     "or give landmarks or a start matrix.",
 }
 
@@ -84,7 +84,7 @@ class Alignment:
         mirror_ratio: the same for the mirror image of the cloud at its own best pose; below 1 it fits better.
     """
 
-    outcome: Outcome
+    outcome: AlignmentOutcome
     pose: Pose
     rms: float
     inliers: float
@@ -96,7 +96,7 @@ class Alignment:
     @property
     def is_found(self) -> bool:
         """True where the pose may be used."""
-        return self.outcome is Outcome.FOUND
+        return self.outcome is AlignmentOutcome.FOUND
 
 
 def align(surface: Surface, cloud: ArrayLike) -> Alignment:
@@ -353,14 +353,14 @@ def _evidence(best: Floats, other: Floats) -> float:
 
 def _outcome(
     shape: _Shape, misfit: float, inliers: float, mirrored_inliers: float, against: float, mirror: float
-) -> Outcome:
+) -> AlignmentOutcome:
     if mirrored_inliers >= _FEWEST_INLIERS and mirror * _MIRRORED < 1:
-        return Outcome.MIRRORED
+        return AlignmentOutcome.MIRRORED
     if inliers < _FEWEST_INLIERS:
-        return Outcome.NO_MATCH
+        return AlignmentOutcome.NO_MATCH
     if against < _UNIQUE or (mirror < _UNIQUE and not _is_its_own_mirror(shape, misfit)):
-        return Outcome.AMBIGUOUS
-    return Outcome.FOUND
+        return AlignmentOutcome.AMBIGUOUS
+    return AlignmentOutcome.FOUND
 
 
 def _is_its_own_mirror(shape: _Shape, misfit: float) -> bool:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from softtwin.meshes.body import Body
 
 from .evidence import Scale
-from .forward import Discrepancy, ForwardModel, reduce_model
+from .forward import Discrepancy, ForwardModel, ReducedModel, reduce_model
 from .pose import Pose
 from .residuals import SurfaceDistance
 
@@ -57,6 +57,16 @@ class Forces:
     def forces(self, coefficients: Floats) -> Floats:
         """Nodal forces, (n, 3), newtons."""
         return (self.basis @ coefficients).reshape(-1, 3)
+
+    def combined(self, kept: Floats) -> Forces:
+        """The forces in orthonormal combinations of their directions; the net force of the others is left in doubt.
+
+        Args:
+            kept: combinations, (k, kept).
+        """
+        rest = self.net_basis - (self.net_basis @ kept) @ kept.T
+        every = self.basis if self.every is None else self.every
+        return replace(self, basis=self.basis @ kept, left_out=self.left_out + rest @ rest.T, every=every)
 
     def leading(self, count: int) -> Forces:
         """The first directions alone: those that move the observed side most, where they were reduced."""
@@ -131,25 +141,30 @@ class Informed:
 def informed(forces: Forces, model: ForwardModel, observed: SurfaceDistance, rule: Informed | None = None) -> Forces:
     """The forces reduced to the directions that a cloud of the observed side can tell at rest.
 
-    They are the leading eigenvectors of the prior-whitened Gauss-Newton matrix at rest: the likelihood-informed
-    subspace (Spantini et al. 2015). What is left out keeps its prior variance in the net force.
-
     Args:
         forces: the forces.
         model: forward model, for its tangent at rest.
         observed: the observed side.
         rule: what is told from what.
     """
-    rule = rule or Informed()
-    state = reduce_model(model, observed.nodes, forces.basis).solve(np.zeros(forces.size))
-    moved = state.jacobian(_observing_rows(observed))
+    return forces.combined(told(reduce_model(model, observed.nodes, forces.basis), observed, rule or Informed()))
+
+
+def told(model: ReducedModel, observed: SurfaceDistance, rule: Informed) -> Floats:
+    """Orthonormal combinations of a force basis that a cloud can tell at rest, (k, kept), those told best first.
+
+    They are the leading eigenvectors of the prior-whitened Gauss-Newton matrix at rest: the likelihood-informed
+    subspace (Spantini et al. 2015).
+
+    Args:
+        model: between the coefficients of the basis and the observed nodes.
+        observed: the observed side.
+        rule: what is told from what.
+    """
+    moved = model.solve(np.zeros(model.count)).jacobian(_observing_rows(observed))
     squares, vectors = np.linalg.eigh(moved.T @ moved)
     information = squares[::-1] * (rule.scale / rule.noise) ** 2 * rule.points
-    kept = vectors[:, ::-1][:, : min(rule.most, max(int((information > rule.information).sum()), 1))]
-    net = forces.net_basis
-    rest = net - (net @ kept) @ kept.T
-    every = forces.basis if forces.every is None else forces.every
-    return replace(forces, basis=forces.basis @ kept, left_out=forces.left_out + rest @ rest.T, every=every)
+    return vectors[:, ::-1][:, : min(rule.most, max(int((information > rule.information).sum()), 1))]
 
 
 def windowed(forces: Forces, where: Floats) -> Forces:
@@ -235,11 +250,13 @@ class ModelError:
     Args:
         discrepancy: of the model, for a largest displacement of one metre.
         observed: rows of its modes at the observed nodes, (3p, m).
+        left_out: its rest there, (p,).
         size: largest displacement that is reckoned with, metres.
     """
 
     discrepancy: Discrepancy
     observed: Floats
+    left_out: Floats
     size: float
 
     @classmethod
@@ -251,17 +268,17 @@ class ModelError:
             nodes: numbers of the observed nodes, (p,).
         """
         rows = (3 * nodes[:, None] + np.arange(3)).ravel()
-        return cls(discrepancy, np.ascontiguousarray(discrepancy.modes[rows]), 1.0)
+        return cls(discrepancy, np.ascontiguousarray(discrepancy.modes[rows]), discrepancy.rest[nodes], 1.0)
 
     @property
     def count(self) -> int:
         """Number of unknowns."""
         return self.observed.shape[1]
 
-    @property
-    def rest(self) -> float:
-        """Standard deviation of a point's distance by what the modes leave out, metres."""
-        return self.size * self.discrepancy.rest
+    @cached_property
+    def rest(self) -> Floats:
+        """Standard deviation of an observed node's distance by what the modes leave out, (p,), metres."""
+        return self.size * self.left_out
 
     @cached_property
     def modes(self) -> Floats:

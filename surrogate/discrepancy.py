@@ -43,18 +43,15 @@ def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 64) -> Sur
         most: most patterns kept.
     """
     missing = relative_errors(surrogate, data, data.samples("validation"))
-    boundary = (3 * data.body.boundary_nodes[:, None] + np.arange(3)).ravel()
-    left_out = []
+    left_out = np.zeros_like(missing)
     for fold in range(_FOLDS):
         held = np.arange(len(missing)) * _FOLDS // len(missing) == fold  # whole paths: their samples are alike
         modes = _modes(missing[~held], most)[0]
-        rest = missing[held] - (missing[held] @ modes) @ modes.T
-        left_out.append((rest[:, boundary] ** 2).mean(axis=1))
+        left_out[held] = missing[held] - (missing[held] @ modes) @ modes.T
     modes, sizes = _modes(missing, most)
-    frame = replace(surrogate.frame, error_modes=modes * sizes)
-    rest_size = float(np.sqrt(np.concatenate(left_out).mean()))
-    card = {**surrogate.card, "discrepancy": {"samples": len(missing), "rest": rest_size}}
-    return Surrogate(surrogate.body, frame, surrogate.core, card)
+    rest = np.sqrt((left_out**2).mean(axis=0).reshape(-1, 3).mean(axis=1))
+    frame = replace(surrogate.frame, error_modes=modes * sizes, error_rest=rest)
+    return Surrogate(surrogate.body, frame, surrogate.core, surrogate.card)
 
 
 def _modes(missing: Floats, most: int) -> tuple[Floats, Floats]:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -74,6 +75,7 @@ class Frame:
         right: of the linear response, (r, 3l), 1/N; None for the identity.
         spread: root mean square of each coordinate over the training loads, (d,); None where it was not measured.
         error_modes: modes of `Discrepancy`, (3n, m); None where they were not measured.
+        error_rest: its rest, (n,).
     """
 
     loaded: Ints
@@ -84,6 +86,7 @@ class Frame:
     right: Floats | None = None
     spread: Floats | None = None
     error_modes: Floats | None = None
+    error_rest: Floats | None = None
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What to store."""
@@ -110,11 +113,11 @@ class Discrepancy:
 
     Args:
         modes: for a of unit variance, (3n, m), dimensionless.
-        rest: standard deviation of what they leave out in one component of a boundary node, dimensionless.
+        rest: standard deviation of what they leave out in one component of each node, (n,), dimensionless.
     """
 
     modes: Floats
-    rest: float
+    rest: Floats
 
 
 def response_parts(response: LinearResponse) -> tuple[Floats, Floats | None]:
@@ -214,8 +217,8 @@ class Surrogate:
     @cached_property
     def discrepancy(self) -> Discrepancy | None:
         """The errors of the validation samples as patterns; None where they were not measured."""
-        modes, rest = self.frame.error_modes, (self.card.get("discrepancy") or {}).get("rest")
-        return None if modes is None or rest is None else Discrepancy(modes, float(rest))
+        modes, rest = self.frame.error_modes, self.frame.error_rest
+        return None if modes is None or rest is None else Discrepancy(modes, rest)
 
     def solve(self, forces: ArrayLike, near: Any = None) -> SurrogateState:
         """The state under nodal forces, (n, 3) newtons.
@@ -332,6 +335,18 @@ class ReducedSurrogate:
         self.linear_rows = frame.linear_rows(picked, basis)
         self.decode_rows = np.ascontiguousarray(frame.decode[picked])
         self.offset_rows = frame.offset[picked]
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients, k."""
+        return self.basis.shape[1]
+
+    def combined(self, matrix: Floats) -> ReducedSurrogate:
+        """The same for the basis times a matrix, (k, j), for the price of some small products."""
+        other = copy(self)
+        other.basis, other.encode = self.basis @ matrix, self.encode @ matrix
+        other.linear_rows = self.linear_rows @ matrix
+        return other
 
     def solve(self, coefficients: ArrayLike, near: Any = None) -> ReducedSurrogateState:
         """The state for force coefficients, (k,); `near` is of no use here.

@@ -26,7 +26,7 @@ class Patterns:
     """Two smooth errors, of 5 % and 3 % of the largest displacement."""
 
     modes: np.ndarray
-    rest: float = 1e-3
+    rest: np.ndarray
 
 
 def patterns(body: Body) -> Patterns:
@@ -34,7 +34,7 @@ def patterns(body: Body) -> Patterns:
     modes = np.zeros((*body.points.shape, 2))
     modes[:, 2, 0], modes[:, 1, 1] = 0.05 * np.sin(np.pi * x), 0.03 * x * (1.0 - x) * 4.0
     modes[body.fixed] = 0.0
-    return Patterns(modes.reshape(-1, 2))
+    return Patterns(modes.reshape(-1, 2), np.full(len(body.points), 1e-3))
 
 
 class Biased(Cantilever):

@@ -10,7 +10,7 @@ from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.shapes import liver_phantom
 from softtwin.registration.pose import Pose
-from softtwin.registration.rigid import Alignment, Outcome, align
+from softtwin.registration.rigid import Alignment, AlignmentOutcome, align
 
 NEAR, FAR = 0.015, 0.030  # metres: a good start; another pose
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -39,7 +39,7 @@ def _error(alignment: Alignment, seen: View) -> float:
 def test_a_bent_organ_is_found_from_one_view(phantom: Body, seed: int) -> None:
     seen = _view(phantom, 0.5, seed)
     found = align(phantom.boundary_surface, seen.cloud)
-    assert found.outcome is Outcome.FOUND and found.is_found
+    assert found.outcome is AlignmentOutcome.FOUND and found.is_found
     assert _error(found, seen) < NEAR
     assert found.inliers > 0.9 and found.rms < 0.008
     assert found.runner_up is not None and found.runner_up_ratio > 1.3 and found.mirror_ratio > 1.3
@@ -77,7 +77,7 @@ def test_a_small_smooth_patch_is_ambiguous(phantom: Body) -> None:
     dome = np.linalg.norm(centre - centre[np.argmin(centre[:, 0] - centre[:, 2])], axis=1) < 0.03
     cloud = centre[dome]
     found = align(phantom.boundary_surface, cloud)
-    assert len(cloud) > 20 and found.outcome is Outcome.AMBIGUOUS
+    assert len(cloud) > 20 and found.outcome is AlignmentOutcome.AMBIGUOUS
     assert "landmarks" in found.outcome.advice
 
 
@@ -100,21 +100,21 @@ def _one_place(rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize(
     ("draw", "outcomes"),
     [
-        (_line, (Outcome.AMBIGUOUS, Outcome.NO_MATCH)),
-        (_plane, (Outcome.AMBIGUOUS, Outcome.NO_MATCH)),
-        (_one_place, (Outcome.AMBIGUOUS,)),
-        (_box, (Outcome.NO_MATCH,)),
+        (_line, (AlignmentOutcome.AMBIGUOUS, AlignmentOutcome.NO_MATCH)),
+        (_plane, (AlignmentOutcome.AMBIGUOUS, AlignmentOutcome.NO_MATCH)),
+        (_one_place, (AlignmentOutcome.AMBIGUOUS,)),
+        (_box, (AlignmentOutcome.NO_MATCH,)),
     ],
 )
-def test_what_holds_no_pose_is_refused(phantom: Body, draw, outcomes: tuple[Outcome, ...]) -> None:
+def test_what_holds_no_pose_is_refused(phantom: Body, draw, outcomes: tuple[AlignmentOutcome, ...]) -> None:
     found = align(phantom.boundary_surface, draw(np.random.default_rng(1)))
     assert found.outcome in outcomes and not found.is_found
 
 
-@pytest.mark.parametrize(("factor", "outcome"), [(1e3, Outcome.NO_MATCH), (1e-3, Outcome.AMBIGUOUS)])
-def test_another_unit_is_refused(phantom: Body, factor: float, outcome: Outcome) -> None:
+@pytest.mark.parametrize(("factor", "outcome"), [(1e3, AlignmentOutcome.NO_MATCH), (1e-3, AlignmentOutcome.AMBIGUOUS)])
+def test_another_unit_is_refused(phantom: Body, factor: float, outcome: AlignmentOutcome) -> None:
     found = align(phantom.boundary_surface, factor * _view(phantom, 0.5, 0).cloud)
-    assert found.outcome is outcome and "unit" in Outcome.NO_MATCH.advice
+    assert found.outcome is outcome and "unit" in AlignmentOutcome.NO_MATCH.advice
 
 
 def test_a_mirrored_cloud_is_refused(phantom: Body) -> None:
@@ -193,5 +193,5 @@ def test_the_liver_is_found_and_never_elsewhere(real: tuple[Body, np.ndarray], s
 def test_a_mirrored_liver_is_called_mirrored(real: tuple[Body, np.ndarray], share: float) -> None:
     found = [align(real[0].boundary_surface, MIRROR * _real_view(real, share, seed).cloud) for seed in range(4)]
     assert not any(a.is_found for a in found)
-    assert sum(a.outcome is Outcome.MIRRORED for a in found) >= 3
-    assert "axes" in Outcome.MIRRORED.advice
+    assert sum(a.outcome is AlignmentOutcome.MIRRORED for a in found) >= 3
+    assert "axes" in AlignmentOutcome.MIRRORED.advice

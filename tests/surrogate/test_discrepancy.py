@@ -20,7 +20,8 @@ def test_patterns_hold_most_of_held_out_errors(reduced: Surrogate, data: DataSet
     rest = missing - (missing @ basis) @ basis.T
     assert (rest**2).sum() < 0.3 * (missing**2).sum()
     assert np.abs(modes.reshape(*known.body.points.shape, -1)[known.body.fixed]).max() < 1e-12
-    assert 0.0 < known.discrepancy.rest < np.sqrt((missing**2).mean())
+    assert known.discrepancy.rest.shape == known.body.points.shape[:1]
+    assert known.discrepancy.rest.max() > 0.0 and (known.discrepancy.rest**2).mean() < (missing**2).mean()
 
 
 def test_their_size_is_that_of_the_errors(reduced: Surrogate, data: DataSet) -> None:
@@ -29,7 +30,7 @@ def test_their_size_is_that_of_the_errors(reduced: Surrogate, data: DataSet) -> 
     every = with_discrepancy(reduced, data, most=len(missing)).discrepancy
     few = with_discrepancy(reduced, data, most=2).discrepancy
     np.testing.assert_allclose((every.modes**2).sum(), (missing**2).sum() / len(missing))
-    assert few.modes.shape[1] == 2 and few.rest > every.rest
+    assert few.modes.shape[1] == 2 and few.rest.sum() > every.rest.sum()
 
 
 def test_a_saved_twin_keeps_them(reduced: Surrogate, data: DataSet, tmp_path: Path) -> None:
@@ -37,4 +38,4 @@ def test_a_saved_twin_keeps_them(reduced: Surrogate, data: DataSet, tmp_path: Pa
     save(known, tmp_path)
     again = load(tmp_path, known.body).discrepancy
     np.testing.assert_array_equal(again.modes, known.discrepancy.modes)
-    assert again.rest == known.discrepancy.rest
+    np.testing.assert_array_equal(again.rest, known.discrepancy.rest)
