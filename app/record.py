@@ -115,6 +115,7 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "net_force_covariance_N2": (turned @ result.net_force_covariance @ turned).tolist(),
         "force_scale_N": result.force_scale,
         "largest_displacement_m": float(np.linalg.norm(result.displacement, axis=1).max()),
+        "model_doubt": result.doubt,
         "largest_correction_m": float(np.linalg.norm(result.correction, axis=1).max()),
         "pose": place.motion(result.pose.matrix).tolist(),
         "points": result.points,

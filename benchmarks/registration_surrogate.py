@@ -36,7 +36,7 @@ def liver_config(seconds: float, ranks: int) -> Config:
             # Many directions of load teach more than many sizes of each: 680 paths of two, not 192 of eight.
             "samples": {"train": 1360, "validation": 96, "test": 192, "block": 8, "path": 2, "ranks": ranks},
             "solver": {"tolerance": 1e-6, "max_iterations": 30, "max_load_steps": 6},
-            "training": {"seconds": seconds},
+            "training": {"seconds": seconds, "width": 512},
         }
     )
 
@@ -56,7 +56,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=400.0)
+    parser.add_argument("--seconds", type=float, default=690.0)
     parser.add_argument("--frames", type=int, default=50)
     parser.add_argument("--smoothness", type=float, default=0.02)
     parser.add_argument("--folder", type=Path, default=RUNS / "liver")

@@ -95,8 +95,8 @@ class ReducedState(Protocol):
     def jacobian(self, rows: csr_array) -> Floats:
         """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p)."""
 
-    def moved(self, change: Floats) -> Floats:
-        """First-order displacement of the chosen nodes, (p, 3), for a change of the coefficients, (k,)."""
+    def moved(self, change: Floats, every: int = 1) -> Floats:
+        """First-order displacement of every so-manieth chosen node, (p, 3), for a change of the coefficients, (k,)."""
 
 
 class ReducedModel(Protocol):
@@ -132,8 +132,8 @@ class _PickedState:
     def jacobian(self, rows: csr_array) -> Floats:
         return rows @ self._basis_pushed()
 
-    def moved(self, change: Floats) -> Floats:
-        return (self._basis_pushed() @ change).reshape(-1, 3)
+    def moved(self, change: Floats, every: int = 1) -> Floats:
+        return self._basis_pushed().reshape(-1, 3, len(change))[::every] @ change
 
 
 class _PickedModel:

@@ -15,6 +15,7 @@ from .residuals import Match, SurfaceDistance
 from .unknowns import Forces, ModelError, PosePrior
 
 Floats = NDArray[np.float64]
+_WATCHED = 300  # nodes whose movement limits a step
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,12 +150,13 @@ class Problem:
         return np.einsum("pi,pij->pj", along, in_camera) * self.pose.deviations
 
     def moved(self, trial: Trial, change: Floats) -> Floats:
-        """How far the observed nodes move towards or from the cloud for a change, first order, (m,), metres."""
-        shifted = trial.state.moved(change[self.force_part])
+        """How far some hundred nodes, spread over those observed, move for a change, first order, (m,), metres."""
+        every = max(1, len(self.observed.nodes) // _WATCHED)
+        shifted = trial.state.moved(change[self.force_part], every)
         if self.pose is not None:
             twist = self.pose.deviations * change[self.pose_part]
-            arm = self.observed.rest - self.pose.centre
+            arm = self.observed.rest[::every] - self.pose.centre
             shifted = shifted + (np.cross(twist[:3], arm) + twist[3:])
         if self.error is not None:
-            shifted = shifted + self.error.observed_field(change[self.error_part])
+            shifted = shifted + self.error.observed_field(change[self.error_part], every)
         return np.sqrt(np.einsum("pi,pi->p", shifted, shifted))

@@ -206,11 +206,11 @@ class Registrar:
         problem = self._problem(points, start.prepared, start.trial, start.doubt)
         near = problem.trial(start.trial.coefficients.copy(), start.trial, anew=True)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
-            problem, found = self._from_rest(points, start.prepared)
+            result = self._finished(points, start.prepared, self._from_rest(points, start.prepared), begin)
         else:
             found = self.options.solver.solve(problem, near.coefficients, near)
-        problem, found, doubt = self._doubted(problem, found, start.doubt)
-        result = self._result(problem, found, start.prepared, begin, doubt)
+            problem, found, doubt = self._doubted(problem, found, start.doubt)
+            result = self._result(problem, found, start.prepared, begin, doubt)
         if self.options.rounds and self._has_left(result, start):
             return self._cold(points, begin)
         return result
@@ -237,10 +237,14 @@ class Registrar:
             return warm
         return min(warm, self.register(cloud), key=_badness)
 
-    def _problem(self, points: Floats, prepared: Prepared, near: Trial | None = None, doubt: float = 1.0) -> Problem:
-        """The problem; near a trial, whose size says how large the model's error may be, with it in patterns."""
-        plain = Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.noise)
-        if self.error is None or near is None:
+    def _plain(self, points: Floats, prepared: Prepared) -> Problem:
+        """The problem with the model's error as the least noise."""
+        return Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.noise)
+
+    def _problem(self, points: Floats, prepared: Prepared, near: Trial, doubt: float = 1.0) -> Problem:
+        """The problem with the model's error in patterns, of the size that belongs to a movement like a trial's."""
+        plain = self._plain(points, prepared)
+        if self.error is None:
             return plain
         moved = np.linalg.norm(near.positions, axis=1).max() + near.match.rms
         error = replace(self.error, size=doubt * float(moved))
@@ -249,30 +253,39 @@ class Registrar:
     def _cold(self, points: Floats, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more from rest for each round of gathering them."""
         prepared = self._everywhere
-        problem, found = self._from_rest(points, prepared)
+        found = self._from_rest(points, prepared)
         for _ in range(self.options.rounds):
             if self._is_hopeless(found):
                 break
-            prepared = self._gathered(prepared.forces.forces(found.trial.coefficients[problem.force_part]))
-            spent = found
-            problem, found = self._from_rest(points, prepared)
-            found = _after(spent, found)
-        problem, found, doubt = self._doubted(problem, found, 1.0)
-        return self._result(problem, found, prepared, begin, doubt)
+            inner = found.trial.coefficients[: prepared.forces.size]
+            prepared = self._gathered(prepared.forces.forces(inner))
+            found = _after(found, self._from_rest(points, prepared))
+        return self._finished(points, prepared, found, begin)
 
-    def _from_rest(self, points: Floats, prepared: Prepared) -> tuple[Problem, Found]:
+    def _from_rest(self, points: Floats, prepared: Prepared) -> Found:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
-        solver = self.options.solver
-        first = prepared.leading(_LEADING)
-        rough = self._problem(points, first)
+        solver, first = self.options.solver, prepared.leading(_LEADING)
+        rough, problem = self._plain(points, first), self._plain(points, prepared)
         begun = solver.rough().solve(rough, np.zeros(rough.size))
-        problem = self._problem(points, prepared, begun.trial)
         start = np.zeros(problem.size)
         start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
         start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
         if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
             solver = solver.without_steps()
-        return problem, _after(begun, solver.solve(problem, start, begun.trial))
+        return _after(begun, solver.solve(problem, start, begun.trial))
+
+    def _finished(self, points: Floats, prepared: Prepared, found: Found, begin: float) -> Registration:
+        """With the model's error in patterns, from a result that took it for noise."""
+        problem, doubt = self._problem(points, prepared, found.trial), 1.0
+        if self.error is not None:
+            solver, is_hopeless = self.options.solver, self._is_hopeless(found)
+            if is_hopeless:
+                solver = solver.without_steps()
+            start = np.concatenate([found.trial.coefficients, np.zeros(self.error.count)])
+            found = _after(found, solver.solve(problem, start, found.trial))
+            if not is_hopeless:
+                problem, found, doubt = self._doubted(problem, found, doubt)
+        return self._result(problem, found, prepared, begin, doubt)
 
     def _is_hopeless(self, found: Found) -> bool:
         return found.posterior.scales.noise > _HOPELESS * self.expectations.noise

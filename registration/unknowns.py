@@ -289,6 +289,6 @@ class ModelError:
         """What is to be added to the model's displacement, (n, 3), metres."""
         return (self.discrepancy.modes @ (self.size * coefficients)).reshape(-1, 3)
 
-    def observed_field(self, coefficients: Floats) -> Floats:
-        """The same at the observed nodes alone, (p, 3)."""
-        return (self.modes @ coefficients).reshape(-1, 3)
+    def observed_field(self, coefficients: Floats, every: int = 1) -> Floats:
+        """The same at the observed nodes alone, one of so many, (p, 3)."""
+        return self.modes.reshape(-1, 3, self.count)[::every] @ coefficients

@@ -69,8 +69,8 @@ class PerceptronCore:
             active.append(z > 0.0)
         return np.maximum(z, 0.0), active
 
-    def push(self, record: Any, tangents: Floats) -> Floats:
-        """Changes of the last hidden values, (3n, k), for changes of the first, (3n, k)."""
+    def push(self, record: Any, tangents: Floats, *, single: bool = False) -> Floats:
+        """Changes of the last hidden values, (3n, k), for changes of the first, (3n, k); always in double precision."""
         values = record[0][:, None] * tangents
         for i in range(self.depth):
             values = record[i + 1][:, None] * (self.weights[f"hidden.{i}.weight"] @ values)

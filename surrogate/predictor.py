@@ -53,8 +53,8 @@ class Core(Protocol):
         """Values, and a record that the derivatives go on from."""
         ...
 
-    def push(self, record: Any, tangents: Floats) -> Floats:
-        """Changes of the values for changes of the coordinates, column by column."""
+    def push(self, record: Any, tangents: Floats, *, single: bool = False) -> Floats:
+        """Changes of the values for changes of the coordinates, column by column; `single`: 1e-6 will do."""
         ...
 
     def pull(self, record: Any, cotangent: Floats) -> Floats:
@@ -279,15 +279,15 @@ class Surrogate:
             )
 
 
-def _tangent(core: Core, record: Any, columns: Floats) -> Floats:
+def _tangent(core: Core, record: Any, columns: Floats, *, single: bool = False) -> Floats:
     """Core derivative times columns, (e, k), by way of the full derivative where the columns outnumber it."""
     if columns.shape[1] > len(columns):
-        return core.push(record, np.eye(len(columns))) @ columns
-    return core.push(record, columns)
+        return core.push(record, np.eye(len(columns)), single=single) @ columns
+    return core.push(record, columns, single=single)
 
 
 class ReducedSurrogateState:
-    """What a reduced surrogate predicts for one set of coefficients: a value.
+    """What a reduced surrogate predicts for one set of coefficients: a value; derivatives are good to 1e-6.
 
     Args:
         model: the reduced surrogate.
@@ -307,15 +307,23 @@ class ReducedSurrogateState:
 
     @cached_property
     def _tangent(self) -> Floats:
-        return _tangent(self._model.surrogate.core, self._record, self._model.encode)
+        return _tangent(self._model.surrogate.core, self._record, self._model.encode, single=True)
 
     def jacobian(self, rows: csr_array) -> Floats:
         """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p); no more is touched."""
         return rows @ self._model.linear_rows + (rows @ self._model.decode_rows) @ self._tangent
 
-    def moved(self, change: Floats) -> Floats:
-        """First-order displacement of the chosen nodes, (p, 3), for a change of the coefficients, (k,)."""
-        return (self._model.linear_rows @ change + self._model.decode_rows @ (self._tangent @ change)).reshape(-1, 3)
+    def moved(self, change: Floats, every: int = 1) -> Floats:
+        """First-order displacement of the chosen nodes, (p, 3), for a change of the coefficients, (k,).
+
+        Args:
+            change: of the coefficients.
+            every: of so many nodes one, the first of all to begin with.
+        """
+        linear, decode = (
+            rows.reshape(-1, 3, rows.shape[1])[::every] for rows in (self._model.linear_rows, self._model.decode_rows)
+        )
+        return linear @ change + decode @ (self._tangent @ change)
 
 
 class ReducedSurrogate:

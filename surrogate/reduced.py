@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -261,17 +262,32 @@ class ReducedCore:
         mean = np.einsum("gij,gi->j", w["turns"], gate * values * w["output_scale"]) / len(w["turns"])
         return mean, (gate, slope, values, slopes)
 
-    def push(self, record: Any, tangents: Floats) -> Floats:
-        """Change of the correction coordinates, (r, k), for changes of the load coordinates, (r, k)."""
-        w = self.weights
+    @cached_property
+    def _single(self) -> dict[str, NDArray[np.float32]]:
+        return {name: array.astype(np.float32) for name, array in self.weights.items()}
+
+    def push(self, record: Any, tangents: Floats, *, single: bool = False) -> Floats:
+        """Change of the correction coordinates, (r, k), for changes of the load coordinates, (r, k).
+
+        Args:
+            record: from `evaluate`.
+            tangents: changes of the load coordinates.
+            single: in single precision: good to 1e-6, in half of the time.
+        """
+        w: dict[str, Any] = self.weights
         gate, slope, values, slopes = record
+        if single:
+            w, tangents = self._single, tangents.astype(np.float32)
+            gate, slope, values = (array.astype(np.float32) for array in (gate, slope, values))
+            slopes = [array.astype(np.float32) for array in slopes]
         dx = (w["turns"] @ tangents) * w["input_scale"][:, None]  # (g, r, k)
         hidden = w["enter.weight"] @ dx
         for i in range(self.depth):
             hidden = hidden + w[f"outer.{i}.weight"] @ (slopes[i][:, :, None] * (w[f"inner.{i}.weight"] @ hidden))
         change = gate[:, :, None] * (w["leave.weight"] @ hidden) + values[:, :, None] * (slope[:, None, :] @ dx)
         change *= w["output_scale"]
-        return (w["turns"].transpose(0, 2, 1) @ change).mean(axis=0)
+        mean: Floats = (w["turns"].transpose(0, 2, 1) @ change).mean(axis=0).astype(np.float64)
+        return mean
 
     def pull(self, record: Any, cotangent: Floats) -> Floats:
         """Gradient with respect to the load coordinates, (r,), for one with respect to the correction, (r,)."""

@@ -17,6 +17,7 @@ from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registrar, Registration, RegistrationOptions, register_sequence
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import Forces, PosePrior, nodal_forces
+from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
 
@@ -145,6 +146,25 @@ def test_sequences_start_warm_and_refuse_bad_clouds(body: Body, rng) -> None:
         list(register_sequence(registrar(body), [bad]))
     with pytest.raises(CloudError):
         list(register_sequence(registrar(body), [clouds[0] + 1.0]))
+
+
+def test_a_tool_that_lets_go_is_no_way_back(body: Body, rng) -> None:
+    """A cloud of the body at rest after a large movement: from rest, with no step."""
+    made = registrar(body)
+    pulled = made.register(cloud_on(body, Cantilever(body).solve(tip_forces(body, NET)).displacement, 300, rng))
+    released = made.register(cloud_on(body, np.zeros_like(body.points), 300, rng, 2e-4), pulled)
+    assert released.outcome is Outcome.CONVERGED and released.judgement.is_usable
+    assert np.abs(released.displacement).max() < 2e-3
+    assert released.trace == ()
+    assert np.linalg.norm(released.net_force[1:]) < 0.05 * np.linalg.norm(NET)
+
+
+def test_little_time_is_spent_on_nonsense(body: Body, rng) -> None:
+    made = registrar(body)
+    nonsense = rng.uniform(body.points.min(axis=0) - 0.1, body.points.max(axis=0) + 0.1, (300, 3))
+    result = made.register(nonsense)
+    assert result.judgement.verdict is Verdict.REFUSED
+    assert result.evaluations < 25
 
 
 def test_large_clouds_are_thinned_and_answer_alike(body: Body, rng) -> None:
