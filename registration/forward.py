@@ -53,6 +53,10 @@ class Discrepancy(Protocol):
     def rest(self) -> Floats:
         """Standard deviation of what they leave out in a component of each node, (n,), for the same displacement."""
 
+    @property
+    def places(self) -> float:
+        """Number of places on the boundary where what they leave out is independent: neighbours share it."""
+
 
 class ForwardModel(Protocol):
     """Nodal forces to states.

@@ -108,11 +108,15 @@ class Problem:
         return self.error.field(trial.coefficients[self.error_part])
 
     def left_out(self, trial: Trial) -> Floats:
-        """Standard deviation of each distance by what the patterns of the model's error leave out, (p,), metres."""
+        """Standard deviation of each distance by what the patterns of the model's error leave out, (p,), metres.
+
+        Neighbours share it: many points tell no more of it than there are places where it is independent.
+        """
         if self.error is None:
             return np.zeros(len(self.cloud))
         corners = self.error.rest[self.observed.triangles[trial.match.triangles]]
-        return np.einsum("pk,pk->p", trial.match.weights, corners)
+        alike = max(len(self.cloud) / self.error.discrepancy.places, 1.0)
+        return np.sqrt(alike) * np.einsum("pk,pk->p", trial.match.weights, corners)
 
     def again(self, trial: Trial) -> Trial:
         """The same trial with its closest points searched anew."""

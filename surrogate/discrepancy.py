@@ -51,7 +51,17 @@ def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 64) -> Sur
     modes, sizes = _modes(missing, most)
     rest = np.sqrt((left_out**2).mean(axis=0).reshape(-1, 3).mean(axis=1))
     frame = replace(surrogate.frame, error_modes=modes * sizes, error_rest=rest)
-    return Surrogate(surrogate.body, frame, surrogate.core, surrogate.card)
+    seen = left_out.reshape(len(missing), -1, 3)[:, data.body.boundary_nodes]
+    card = {**surrogate.card, "discrepancy": {"samples": len(missing), "places": _places(seen)}}
+    return Surrogate(surrogate.body, frame, surrogate.core, card)
+
+
+def _places(fields: Floats) -> float:
+    """Number of places at which fields (s, p, 3) are independent: tr(C)^2 / tr(C^2) of their correlation matrix C."""
+    scaled = fields / np.maximum(np.sqrt((fields**2).mean(axis=(0, 2)))[None, :, None], 1e-300)
+    scaled = np.concatenate(list(scaled.transpose(2, 0, 1)))  # each axis a sample of its own
+    gram = scaled @ scaled.T
+    return float(np.trace(gram) ** 2 / (gram**2).sum())
 
 
 def _modes(missing: Floats, most: int) -> tuple[Floats, Floats]:

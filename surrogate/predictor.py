@@ -114,10 +114,12 @@ class Discrepancy:
     Args:
         modes: for a of unit variance, (3n, m), dimensionless.
         rest: standard deviation of what they leave out in one component of each node, (n,), dimensionless.
+        places: number of places on the boundary where that is independent: neighbours share it.
     """
 
     modes: Floats
     rest: Floats
+    places: float
 
 
 def response_parts(response: LinearResponse) -> tuple[Floats, Floats | None]:
@@ -217,8 +219,8 @@ class Surrogate:
     @cached_property
     def discrepancy(self) -> Discrepancy | None:
         """The errors of the validation samples as patterns; None where they were not measured."""
-        modes, rest = self.frame.error_modes, self.frame.error_rest
-        return None if modes is None or rest is None else Discrepancy(modes, rest)
+        modes, rest, known = self.frame.error_modes, self.frame.error_rest, self.card.get("discrepancy")
+        return None if modes is None or rest is None or not known else Discrepancy(modes, rest, known["places"])
 
     def solve(self, forces: ArrayLike, near: Any = None) -> SurrogateState:
         """The state under nodal forces, (n, 3) newtons.

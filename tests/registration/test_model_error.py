@@ -27,6 +27,7 @@ class Patterns:
 
     modes: np.ndarray
     rest: np.ndarray
+    places: float = 1e6
 
 
 def patterns(body: Body) -> Patterns:

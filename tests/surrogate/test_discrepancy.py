@@ -39,3 +39,4 @@ def test_a_saved_twin_keeps_them(reduced: Surrogate, data: DataSet, tmp_path: Pa
     again = load(tmp_path, known.body).discrepancy
     np.testing.assert_array_equal(again.modes, known.discrepancy.modes)
     np.testing.assert_array_equal(again.rest, known.discrepancy.rest)
+    assert again.places == known.discrepancy.places > 1.0
