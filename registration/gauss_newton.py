@@ -131,6 +131,8 @@ class _Search:
         self.evaluations, self.limit = 1, options.max_step
         self.noise = max(robust_deviation(self.trial.match.distances), problem.noise.least)
         self.trace: list[Step] = []
+        self._at: Trial | None = None
+        self._jacobian: Floats | None = None
 
     def run(self) -> Found:
         options = self.options
@@ -141,7 +143,9 @@ class _Search:
         return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
 
     def _local(self, loss: Loss) -> LocalModel:
-        local = LocalModel(self.problem, self.trial, loss, self.noise, self.options.graduation)
+        if self._at is not self.trial:  # another loss at the same place has the same derivatives
+            self._at, self._jacobian = self.trial, self.problem.jacobian(self.trial)
+        local = LocalModel(self.problem, self.trial, loss, self.noise, self.options.graduation, self._jacobian)
         self.noise = local.scales.noise
         return local
 
@@ -212,12 +216,21 @@ class LocalModel:
         loss: of the points.
         noise: their scale so far, metres, for the weights that the scales are found with.
         graduation: the noise is taken as at least this part of what the linear model promises to change.
+        jacobian: of the distances at the trial, (p, k), where it is known.
     """
 
-    def __init__(self, problem: Problem, trial: Trial, loss: Loss, noise: float, graduation: float = 0.0) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        trial: Trial,
+        loss: Loss,
+        noise: float,
+        graduation: float = 0.0,
+        jacobian: Floats | None = None,
+    ) -> None:
         self.problem, self.trial = problem, trial
         distances, left_out = trial.match.distances, problem.left_out(trial)
-        self.jacobian = problem.jacobian(trial)
+        self.jacobian = problem.jacobian(trial) if jacobian is None else jacobian
         self.scales, self.is_graduated = self._found_scales(loss, noise, left_out, graduation)
         self.noise = self.scales.noise
         self.deviations = np.hypot(self.noise, left_out)

@@ -32,6 +32,7 @@ Floats = NDArray[np.float64]
 # Of the logarithm of a nodal force. A model with an error of its own must not explain that by forces.
 EXACT_SPREAD, LEARNED_SPREAD = 1.0, 0.5
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
+_GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
 _DOUBTS, _SURE = 3, 0.25  # times that the model's error is scaled anew; not where that changes it by less
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
@@ -325,7 +326,8 @@ class Registrar:
         far = robust_deviation(near.match.distances)
         if far < _FAR * max(start.noise, self.options.noise.least):
             return False
-        rest = self.observed.match(np.zeros_like(near.positions), near.cloud)
+        few = near.cloud[:: max(1, len(near.cloud) // _GLANCE)]
+        rest = self.observed.match(np.zeros_like(near.positions), few)
         return robust_deviation(rest.distances) < far
 
     def _has_left(self, result: Registration, start: Registration) -> bool:

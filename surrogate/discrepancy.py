@@ -60,6 +60,7 @@ def _places(fields: Floats) -> float:
     """Number of places at which fields (s, p, 3) are independent: tr(C)^2 / tr(C^2) of their correlation matrix C."""
     scaled = fields / np.maximum(np.sqrt((fields**2).mean(axis=(0, 2)))[None, :, None], 1e-300)
     scaled = np.concatenate(list(scaled.transpose(2, 0, 1)))  # each axis a sample of its own
+    scaled /= np.maximum(np.linalg.norm(scaled, axis=1), 1e-300)[:, None]  # a few large errors must not speak for all
     gram = scaled @ scaled.T
     return float(np.trace(gram) ** 2 / (gram**2).sum())
 

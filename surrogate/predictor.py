@@ -97,10 +97,6 @@ class Frame:
         """Linear part of the displacement, (3n, ...), for forces at the loaded nodes, (3l, ...)."""
         return self.left @ (columns if self.right is None else self.right @ columns)
 
-    def linear_rows(self, rows: Ints, columns: Floats) -> Floats:
-        """Some rows of `linear`, (p, k), without the others' price."""
-        return self.left[rows] @ (columns if self.right is None else self.right @ columns)
-
     def linear_adjoint(self, cotangent: Floats) -> Floats:
         """Linear part of the gradient, (3l,), for a gradient with respect to the displacement, (3n,)."""
         row = cotangent @ self.left
@@ -133,18 +129,17 @@ class SurrogateState:
 
     Args:
         surrogate: the surrogate.
-        loads: forces at its loaded nodes, (3l,), newtons.
+        coordinates: of the load, that the network takes, (d,).
+        linear: linear part of the displacement, (3n,), metres.
     """
 
     negative_pivots: int | None = None  # a network has no tangent to count them of
 
-    def __init__(self, surrogate: Surrogate, loads: Floats) -> None:
+    def __init__(self, surrogate: Surrogate, coordinates: Floats, linear: Floats) -> None:
         frame = surrogate.frame
-        self._surrogate = surrogate
-        self.coordinates = frame.encode @ loads
-        values, self._record = surrogate.core.evaluate(self.coordinates)
-        displacement = frame.offset + frame.linear(loads) + frame.decode @ values
-        self.displacement: Floats = displacement.reshape(-1, 3)
+        self._surrogate, self.coordinates = surrogate, coordinates
+        values, self._record = surrogate.core.evaluate(coordinates)
+        self.displacement: Floats = (frame.offset + linear + frame.decode @ values).reshape(-1, 3)
 
     @property
     def extent(self) -> float | None:
@@ -235,7 +230,8 @@ class Surrogate:
         """
         load = checked_array("Surrogate.forces", forces, self.body.points.shape)
         self._refuse_idle("forces", np.abs(load).max(axis=1))
-        return SurrogateState(self, load.ravel()[self.rows])
+        loads = load.ravel()[self.rows]
+        return SurrogateState(self, self.frame.encode @ loads, self.frame.linear(loads))
 
     def reduced(self, nodes: ArrayLike, basis: ArrayLike) -> ReducedSurrogate:
         """The surrogate between a few force coefficients and a few nodes, all that can be computed before computed.
@@ -305,7 +301,8 @@ class ReducedSurrogateState:
     @cached_property
     def full(self) -> SurrogateState:
         """The whole state."""
-        return SurrogateState(self._model.surrogate, self._model.basis @ self.coefficients)
+        model = self._model
+        return SurrogateState(model.surrogate, model.encode @ self.coefficients, model.linear @ self.coefficients)
 
     @cached_property
     def _tangent(self) -> Floats:
@@ -340,22 +337,23 @@ class ReducedSurrogate:
     def __init__(self, surrogate: Surrogate, nodes: Ints, basis: Floats) -> None:
         frame = surrogate.frame
         picked = (3 * nodes[:, None] + np.arange(3)).ravel()
-        self.surrogate, self.basis = surrogate, basis
+        self.surrogate, self._picked = surrogate, picked
         self.encode = frame.encode @ basis
-        self.linear_rows = frame.linear_rows(picked, basis)
+        self.linear = frame.linear(basis)
+        self.linear_rows = np.ascontiguousarray(self.linear[picked])
         self.decode_rows = np.ascontiguousarray(frame.decode[picked])
         self.offset_rows = frame.offset[picked]
 
     @property
     def count(self) -> int:
         """Number of coefficients, k."""
-        return self.basis.shape[1]
+        return self.encode.shape[1]
 
     def combined(self, matrix: Floats) -> ReducedSurrogate:
         """The same for the basis times a matrix, (k, j), for the price of some small products."""
         other = copy(self)
-        other.basis, other.encode = self.basis @ matrix, self.encode @ matrix
-        other.linear_rows = self.linear_rows @ matrix
+        other.encode, other.linear = self.encode @ matrix, self.linear @ matrix
+        other.linear_rows = np.ascontiguousarray(other.linear[self._picked])
         return other
 
     def solve(self, coefficients: ArrayLike, near: Any = None) -> ReducedSurrogateState:
