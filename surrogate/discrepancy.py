@@ -35,14 +35,18 @@ def relative_errors(surrogate: Surrogate, data: DataSet, samples: Samples) -> Fl
 def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 64) -> Surrogate:
     """The surrogate with the patterns of its errors on the validation samples: see `Discrepancy`.
 
-    What the patterns leave out is measured on samples that they were not made from.
+    What the patterns leave out is measured on samples that they were not made from. Of fewer than four samples nothing
+    is learned: the surrogate stays as it is.
 
     Args:
         surrogate: the surrogate.
         data: the data set that it was trained on.
         most: most patterns kept.
     """
-    missing = relative_errors(surrogate, data, data.samples("validation"))
+    samples = data.samples("validation")
+    if len(samples) < _FOLDS:
+        return surrogate
+    missing = relative_errors(surrogate, data, samples)
     left_out = np.zeros_like(missing)
     for fold in range(_FOLDS):
         held = np.arange(len(missing)) * _FOLDS // len(missing) == fold  # whole paths: their samples are alike
@@ -62,7 +66,7 @@ def _places(fields: Floats) -> float:
     scaled = np.concatenate(list(scaled.transpose(2, 0, 1)))  # each axis a sample of its own
     scaled /= np.maximum(np.linalg.norm(scaled, axis=1), 1e-300)[:, None]  # a few large errors must not speak for all
     gram = scaled @ scaled.T
-    return float(np.trace(gram) ** 2 / (gram**2).sum())
+    return max(1.0, float(np.trace(gram) ** 2 / max((gram**2).sum(), 1e-300)))
 
 
 def _modes(missing: Floats, most: int) -> tuple[Floats, Floats]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from softtwin.reference.dataset import DataSet
 from softtwin.surrogate.discrepancy import relative_errors, with_discrepancy
@@ -40,3 +41,9 @@ def test_a_saved_twin_keeps_them(reduced: Surrogate, data: DataSet, tmp_path: Pa
     np.testing.assert_array_equal(again.modes, known.discrepancy.modes)
     np.testing.assert_array_equal(again.rest, known.discrepancy.rest)
     assert again.places == known.discrepancy.places > 1.0
+
+
+def test_too_few_samples_say_nothing(reduced: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
+    three = data.samples("validation", 3)
+    monkeypatch.setattr(DataSet, "samples", lambda *_: three)
+    assert with_discrepancy(reduced, data).discrepancy is None
