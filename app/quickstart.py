@@ -25,9 +25,9 @@ from .twin import Frame, Twin, forward_model
 from .workspace import Workspace, timed
 
 Floats = NDArray[np.float64]
-_CAMERA = np.array([-0.3, -1.0, 0.25])  # from the organ towards the camera: the phantom's front, a little from above
-_POINTS = 1000
-_NOISE = 5e-4
+CAMERA = np.array([-0.3, -1.0, 0.25])  # from the organ towards the camera: the phantom's front, a little from above
+POINTS = 1000
+NOISE = 5e-4
 DEMOS = {
     "surrogate": ("surrogate", "tool"),
     "surrogate-without-zone": ("surrogate", ""),
@@ -86,7 +86,7 @@ def _demo(space: Workspace, folder: Path, body: Body, say: Callable[[str], None]
     with forward_model("reference", space.twin, body, space.config) as reference:
         forces, zone = unseen_load(body, reference, space.config.loads.displacement)
         truth = reference.solve(forces).displacement
-    cloud = partial_view(body, truth, _CAMERA, _POINTS, _NOISE, np.random.default_rng(11), surface="observed")
+    cloud = partial_view(body, truth, CAMERA, POINTS, NOISE, np.random.default_rng(11), surface="observed")
     np.save(folder / "cloud.npy", cloud)
     np.save(folder / "truth.npy", truth)
     for name, error in _target_errors(body, np.zeros_like(truth), truth).items():

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from record import write
 from threadpoolctl import threadpool_limits
 
-from softtwin.app.quickstart import _CAMERA, _NOISE, _POINTS  # what its own cloud is made with
+from softtwin.app.quickstart import CAMERA, NOISE, POINTS  # what its own cloud is made with
 from softtwin.app.twin import Twin
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
@@ -61,9 +61,9 @@ def main() -> None:
 
         def seen(count: int, seed: int) -> Floats:
             rng = np.random.default_rng(seed)
-            return partial_view(body, truth, _CAMERA, count, _NOISE, rng, surface="observed")
+            return partial_view(body, truth, CAMERA, count, NOISE, rng, surface="observed")
 
-        clouds = [own, *(seen(_POINTS, 100 + draw) for draw in range(arguments.draws))]
+        clouds = [own, *(seen(POINTS, 100 + draw) for draw in range(arguments.draws))]
         twin.registrar("")  # prepared once
         last: Registration | None = None
         for cloud in clouds:
