@@ -297,7 +297,7 @@ class Registrar:
         The scale is MacKay's (1992): the squares of the unknowns over the number that the cloud tells of them.
         """
         for _ in range(_DOUBTS):
-            if problem.error is None:
+            if problem.error is None or not found.outcome.is_success:
                 break
             unknown = found.trial.coefficients[problem.error_part]
             variances = np.diag(found.posterior.covariance)[problem.error_part]
