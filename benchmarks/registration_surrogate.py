@@ -56,7 +56,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=690.0)
+    parser.add_argument("--seconds", type=float, default=270.0)
     parser.add_argument("--frames", type=int, default=50)
     parser.add_argument("--smoothness", type=float, default=0.02)
     parser.add_argument("--folder", type=Path, default=RUNS / "liver")
