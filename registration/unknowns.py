@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from softtwin.meshes.body import Body
 
 from .evidence import Scale
-from .forward import Discrepancy, ForwardModel, ReducedModel, reduce_model
+from .forward import Discrepancy, ReducedModel
 from .pose import Pose
 from .residuals import SurfaceDistance
 
@@ -136,18 +136,6 @@ class Informed:
     scale: float = 0.03
     information: float = 0.5
     most: int = 96
-
-
-def informed(forces: Forces, model: ForwardModel, observed: SurfaceDistance, rule: Informed | None = None) -> Forces:
-    """The forces reduced to the directions that a cloud of the observed side can tell at rest.
-
-    Args:
-        forces: the forces.
-        model: forward model, for its tangent at rest.
-        observed: the observed side.
-        rule: what is told from what.
-    """
-    return forces.combined(told(reduce_model(model, observed.nodes, forces.basis), observed, rule or Informed()))
 
 
 def told(model: ReducedModel, observed: SurfaceDistance, rule: Informed) -> Floats:

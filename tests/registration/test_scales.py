@@ -9,8 +9,9 @@ from softtwin.meshes.body import Body
 from softtwin.registration.evidence import Scale, find_scales, linearised
 from softtwin.registration.loss import Huber, Loss, Square, Tukey, robust_deviation
 from softtwin.registration.posterior import posterior
+from softtwin.registration.registrar import Prepared
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import Informed, contact, informed, nodal_forces, windowed
+from softtwin.registration.unknowns import Forces, Informed, contact, nodal_forces, windowed
 
 from .conftest import Cantilever
 
@@ -72,16 +73,20 @@ def test_a_scale_that_is_known_stays(rng) -> None:
     assert find_scales(local, Scale(1e-2, 1.0, least=5.0), Scale(0.05, 1.0)).noise >= 5.0 * 0.95
 
 
+def told_forces(forces: Forces, observed: SurfaceDistance, rule: Informed) -> Forces:
+    return Prepared.of(Cantilever(observed.body), observed, forces).informed(observed, rule).forces
+
+
 def test_what_is_left_out_keeps_its_variance(body: Body) -> None:
     every = nodal_forces(body, body.node_sets["tip"], Scale(0.1, 1.0))
     observed = SurfaceDistance(body, body.surfaces["observed"])
-    few = informed(every, Cantilever(body), observed, Informed(most=2))
+    few = told_forces(every, observed, Informed(most=2))
     assert few.size == 2 and few.directions == every.size
     prior = every.net_basis @ every.net_basis.T
     np.testing.assert_allclose(few.net_basis @ few.net_basis.T + few.left_out, prior, atol=1e-9 * prior.max())
     np.testing.assert_allclose(few.basis.T @ few.basis, np.eye(2), atol=1e-12)
     # This model moves by three sums of the forces alone: with three directions nothing that moves is left out.
-    three = informed(every, Cantilever(body), observed, Informed(most=50))
+    three = told_forces(every, observed, Informed(most=50))
     assert three.size == 3
 
 
@@ -128,7 +133,7 @@ def test_contact_is_where_the_forces_are(body: Body) -> None:
 def test_windowed_forces_keep_the_variance_of_what_is_left_out(body: Body) -> None:
     every = nodal_forces(body, body.node_sets["tip"], Scale(0.1, 1.0), smoothness=0.1)
     observed = SurfaceDistance(body, body.surfaces["observed"])
-    few = informed(every, Cantilever(body), observed, Informed(most=2))
+    few = told_forces(every, observed, Informed(most=2))
     where = np.linspace(0.1, 1.0, len(body.points))
     inside = windowed(few, where)
     whole = (np.repeat(where, 3)[:, None] * every.basis).reshape(-1, 3, every.size).sum(axis=0)
