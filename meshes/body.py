@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from .elements import KINDS, Kind, quadratic_kind, split_facets
 
@@ -213,6 +214,11 @@ class Body:
     def boundary_nodes(self) -> Ints:
         """Numbers of the nodes on the boundary, sorted."""
         return _frozen(np.unique(self.facets))
+
+    @cached_property
+    def boundary_tree(self) -> cKDTree:
+        """The boundary nodes, to be asked for the nearest ones."""
+        return cKDTree(self.points[self.boundary_nodes])
 
     @property
     def boundary_surface(self) -> Surface:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 from vtkmodules.vtkCommonCore import vtkPoints
 
 from .body import Body, Floats, Surface
 from .closest import cell_locator
 
 _LIMIT_OF_SIZE = 0.5  # a cloud farther from the body than this part of its size needs a rigid start
+_GLANCE = 200  # points that a cloud's distance is judged by
 _UNIT_RATIO = 50.0  # a cloud this many times larger than the body is in another unit
 
 
@@ -160,9 +160,10 @@ def check_cloud(cloud: ArrayLike, body: Body, limit: float | None = None) -> Flo
 
 
 def _check_distance(points: Floats, body: Body, limit: float) -> None:
-    distances, _ = cKDTree(body.points[body.boundary_nodes]).query(points)
-    if np.median(distances) <= limit:
+    few = points[:: max(1, len(points) // _GLANCE)]
+    if np.median(body.boundary_tree.query(few)[0]) <= limit:
         return
+    distances, _ = body.boundary_tree.query(points)
     centroids = float(np.linalg.norm(points.mean(axis=0) - body.points[body.boundary_nodes].mean(axis=0)))
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     advice = (

@@ -8,6 +8,7 @@ both scales with wide log-normal priors.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,7 @@ class Scale:
         """The same belief with a larger least value."""
         return replace(self, least=max(self.least, least))
 
+    @cached_property
     def grid(self) -> tuple[Floats, Floats]:
         """Logarithms of values, multiples of one step, (g,), and the logarithm of their probability, (g,)."""
         middle = np.log(max(self.median, self.least))
@@ -108,19 +110,17 @@ def linearised(
         beside: N, derivative of the residuals by unknowns of unit variance, (p, q), and their values, (q,).
         shares: part of the variance of each point's distance that is its noise so far, (p,); all of it if not given.
     """
+    count = jacobian.shape[1]
+    columns, values = (np.zeros((len(residuals), 0)), np.zeros(0)) if beside is None else beside
     root = np.sqrt(weights if shares is None else weights * shares)
-    inner = root[:, None] * jacobian
-    data = root * (jacobian @ coefficients - residuals)
-    matrix, pulled, square = inner.T @ inner, inner.T @ data, float(data @ data)
-    if beside is not None and beside[0].shape[1]:
-        columns, values = beside
-        data = data + root * (columns @ values)
-        outer = (root / noise)[:, None] * columns
-        factor = cho_factor(np.eye(len(values)) + outer.T @ outer)
-        cross, across = outer.T @ inner, outer.T @ data
-        matrix = matrix - cross.T @ cho_solve(factor, cross)
-        pulled = inner.T @ data - cross.T @ cho_solve(factor, across)
-        square = float(data @ data - across @ cho_solve(factor, across))
+    stacked = np.column_stack([jacobian, jacobian @ coefficients - residuals + columns @ values, columns / noise])
+    stacked *= root[:, None]
+    products = stacked.T @ stacked
+    if len(values):
+        across = products[count + 1 :, : count + 1]
+        factor = cho_factor(np.eye(len(values)) + products[count + 1 :, count + 1 :], check_finite=False)
+        products = products[: count + 1, : count + 1] - across.T @ cho_solve(factor, across, check_finite=False)
+    matrix, pulled, square = products[:count, :count], products[:count, count], float(products[count, count])
     information, vectors = np.linalg.eigh(matrix)
     information = np.maximum(np.asarray(information, dtype=np.float64), 0.0)
     projections: Floats = vectors.T @ pulled
@@ -153,8 +153,8 @@ def find_scales(problem: Linearised, noise: Scale, force: Scale) -> Scales:
         noise: prior of the noise.
         force: prior of the coefficients' scale.
     """
-    log_noise, noise_prior = noise.grid()
-    log_force, force_prior = force.grid()
+    log_noise, noise_prior = noise.grid
+    log_force, force_prior = force.grid
     seen = problem.information > _SEEN * problem.information.max(initial=0.0)
     information, projections = problem.information[seen], problem.projections[seen]
     # Both grids have one step: sums over the directions depend on the ratio of the scales alone.

@@ -19,6 +19,8 @@ from .problem import Problem, Trial
 
 Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
+_KEPT = 0.2  # a whole step that misses its promise by less: where only a start is wanted, it was the last
+_UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
 
 
 @dataclass(frozen=True)
@@ -131,8 +133,7 @@ class _Search:
         self.evaluations, self.limit = 1, options.max_step
         self.noise = max(robust_deviation(self.trial.match.distances), problem.noise.least)
         self.trace: list[Step] = []
-        self._at: Trial | None = None
-        self._jacobian: Floats | None = None
+        self._at: LocalModel | None = None
 
     def run(self) -> Found:
         options = self.options
@@ -143,30 +144,37 @@ class _Search:
         return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
 
     def _local(self, loss: Loss) -> LocalModel:
-        if self._at is not self.trial:  # another loss at the same place has the same derivatives
-            self._at, self._jacobian = self.trial, self.problem.jacobian(self.trial)
-        local = LocalModel(self.problem, self.trial, loss, self.noise, self.options.graduation, self._jacobian)
-        self.noise = local.scales.noise
-        return local
+        """The model about the trial; what is known there already is not computed again."""
+        at = self._at
+        if at is None or at.trial is not self.trial or at.loss is not loss:
+            jacobian = None if at is None or at.trial is not self.trial else at.jacobian
+            at = LocalModel(self.problem, self.trial, loss, self.noise, self.options.graduation, jacobian)
+            self._at, self.noise = at, at.scales.noise
+        return at
 
     def _descend(self, loss: Loss, settled: float) -> Outcome:
+        is_handed_on, is_exact = settled >= self.options.handed_on, False
         while len(self.trace) < self.options.max_iterations:
             local = self._local(loss)
-            length = local.length
-            if length < settled and not local.is_graduated:
-                if settled >= self.options.handed_on or self._is_closest():
+            if local.length < settled and not local.is_graduated:
+                if is_handed_on or is_exact or self._is_closest(local, settled):
                     return Outcome.CONVERGED
+                is_exact = True
                 continue
+            is_exact = False
             refused = self._step(local, loss)
             if refused is not None:
                 return refused
+            if is_handed_on and local.was_whole and abs(self.trace[-1].gain - 1.0) < _KEPT:
+                return Outcome.CONVERGED
         return Outcome.MOST_ITERATIONS
 
-    def _is_closest(self) -> bool:
-        """Search the closest points anew; True where that changes nothing beside the noise."""
-        before, self.trial = self.trial, self.problem.again(self.trial)
-        changed = np.abs(self.trial.match.distances - before.match.distances).max()
-        return bool(changed < 0.1 * self.noise)
+    def _is_closest(self, local: LocalModel, settled: float) -> bool:
+        """Search the closest points anew; True where that moves the minimum no further than the search goes."""
+        before, again = self.trial.match.distances, self.problem.again(self.trial)
+        if np.abs(again.match.distances - before).max() >= _UNCHANGED * self.noise:
+            self.trial = again
+        return local.length_for(again.match.distances) < settled
 
     def _step(self, local: LocalModel, loss: Loss) -> Outcome | None:
         """Take the best step within the limit; None when one was taken."""
@@ -228,7 +236,8 @@ class LocalModel:
         graduation: float = 0.0,
         jacobian: Floats | None = None,
     ) -> None:
-        self.problem, self.trial = problem, trial
+        self.problem, self.trial, self.loss = problem, trial, loss
+        self.was_whole = True
         distances, left_out = trial.match.distances, problem.left_out(trial)
         self.jacobian = problem.jacobian(trial) if jacobian is None else jacobian
         self.scales, self.is_graduated = self._found_scales(loss, noise, left_out, graduation)
@@ -237,11 +246,15 @@ class LocalModel:
         self.weights = loss.weight(distances / self.deviations)
         self.precision = np.ones(problem.size)
         self.precision[problem.force_part] = 1.0 / self.scales.force**2
-        trust = self.weights / self.deviations**2
-        self.information = self.jacobian.T @ (trust[:, None] * self.jacobian)
+        trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
+        self.information = trusted.T @ trusted
         self._hessian = self.information + np.diag(self.precision)
-        self.gradient = self.jacobian.T @ (trust * distances) + self.precision * trial.coefficients
+        self.gradient = self._gradient(distances, self.weights)
         self.value = self.objective(trial, loss)
+
+    def _gradient(self, distances: Floats, weights: Floats) -> Floats:
+        by_distances = weights * distances / self.deviations**2
+        return by_distances @ self.jacobian + self.precision * self.trial.coefficients
 
     def _found_scales(self, loss: Loss, noise: float, left_out: Floats, graduation: float) -> tuple[Scales, bool]:
         """Scales, and whether the noise is held above what the linear model alone would believe."""
@@ -271,10 +284,18 @@ class LocalModel:
         return values, vectors
 
     @cached_property
+    def _factor(self) -> tuple[Floats, bool]:
+        factor: tuple[Floats, bool] = cho_factor(self._scaled_hessian, check_finite=False)
+        return factor
+
+    def _whole_for(self, gradient: Floats) -> Floats:
+        root = 1.0 / np.sqrt(self.precision)
+        return -root * cho_solve(self._factor, root * gradient, check_finite=False)
+
+    @cached_property
     def _whole(self) -> Floats:
         """The whole step."""
-        root = 1.0 / np.sqrt(self.precision)
-        return -root * cho_solve(cho_factor(self._scaled_hessian), root * self.gradient)
+        return self._whole_for(self.gradient)
 
     def objective(self, trial: Trial, loss: Loss) -> float:
         """Robust distances and prior at these scales."""
@@ -284,7 +305,12 @@ class LocalModel:
     @property
     def length(self) -> float:
         """Length of the whole step in posterior deviations a coefficient."""
-        return float(np.sqrt(max(-float(self._whole @ self.gradient), 0.0) / len(self._whole)))
+        return _length(self._whole, self.gradient)
+
+    def length_for(self, distances: Floats) -> float:
+        """The same were the points as far from the surface as given, (p,), metres, with these derivatives."""
+        gradient = self._gradient(distances, self.loss.weight(distances / self.deviations))
+        return _length(self._whole_for(gradient), gradient)
 
     def _damped(self, damping: float) -> Floats:
         values, vectors = self._eigen
@@ -296,6 +322,7 @@ class LocalModel:
         """The best change of the coefficients that moves no observed node further than the limit, metres."""
         change, damping = self._whole, 0.0
         while self.largest_movement(change) > 1.05 * limit:
+            self.was_whole = False
             damping = max(1.6 * damping, 1e-8 * self._eigen[0][-1], 0.1)
             change = self._damped(damping)
         return change
@@ -311,3 +338,7 @@ class LocalModel:
     def posterior(self) -> Posterior:
         """Laplace's approximation at the trial."""
         return posterior(self.information, self.precision, self.trial.coefficients, self.scales)
+
+
+def _length(step: Floats, gradient: Floats) -> float:
+    return float(np.sqrt(max(-float(step @ gradient), 0.0) / len(step)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -92,14 +93,29 @@ class Problem:
         Raises:
             NotConverged: the model found no state.
         """
+        from_match = None if near is None or anew else near.match
+        return self._at(coefficients, near, lambda moved, cloud: self.observed.match(moved, cloud, from_match))
+
+    def begun(self, coefficients: Floats, near: Trial | None = None) -> Trial:
+        """The same for another cloud than the trial's: closest points by the nearest vertices, good for a start.
+
+        Args:
+            coefficients: (k,).
+            near: a trial to start the model from.
+
+        Raises:
+            NotConverged: the model found no state.
+        """
+        return self._at(coefficients, near, self.observed.match_nearby)
+
+    def _at(self, coefficients: Floats, near: Trial | None, matched: Callable[[Floats, Floats], Match]) -> Trial:
         state = self.model.solve(coefficients[self.force_part], None if near is None else near.state)
         positions = state.positions
         if self.error is not None:
             positions = positions + self.error.observed_field(coefficients[self.error_part])
         pose = None if self.pose is None else self.pose.pose(coefficients[self.pose_part])
         cloud = self.cloud if pose is None else pose.inverse().apply(self.cloud)
-        match = self.observed.match(positions, cloud, None if near is None or anew else near.match)
-        return Trial(coefficients, state, positions, pose, cloud, match)
+        return Trial(coefficients, state, positions, pose, cloud, matched(positions, cloud))
 
     def correction(self, trial: Trial) -> Floats:
         """What the model's error adds to the displacement of all nodes, (n, 3), metres."""
@@ -129,7 +145,7 @@ class Problem:
         if self.pose is not None:
             blocks.append(self._by_pose(trial))
         if self.error is not None:
-            blocks.append(rows @ self.error.modes)
+            blocks.append(self.error.jacobian(rows))
         return np.hstack(blocks)
 
     def pulled(self, trial: Trial, cotangent: Floats) -> Floats:
@@ -141,7 +157,7 @@ class Problem:
         if self.pose is not None:
             blocks.append(cotangent @ self._by_pose(trial))
         if self.error is not None:
-            blocks.append(by_nodes.ravel() @ self.error.modes)
+            blocks.append(self.error.jacobian(by_nodes.ravel()))
         return np.concatenate(blocks)
 
     def _by_pose(self, trial: Trial) -> Floats:

@@ -53,6 +53,7 @@ class RegistrationOptions:
         rounds: how often a cold start gathers the forces where it found some.
         reach: forces within this part of the body's size are gathered together.
         informed: which directions are kept of gathered forces.
+        few_points: so many are enough to find the place of the forces.
     """
 
     noise: Scale = NOISE
@@ -61,10 +62,12 @@ class RegistrationOptions:
     rounds: int = 2
     reach: float = 0.035
     informed: Informed = field(default_factory=Informed)
+    few_points: int = 300
 
     def __post_init__(self) -> None:
-        if self.most_points < 1:
-            raise ValueError(f"RegistrationOptions.most_points: expected at least 1, got {self.most_points}.")
+        for name in ("most_points", "few_points"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"RegistrationOptions.{name}: expected at least 1, got {getattr(self, name)}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +208,7 @@ class Registrar:
         if start is None:
             return self._cold(points, begin)
         problem = self._problem(points, start.prepared, start.trial, start.doubt)
-        near = problem.trial(start.trial.coefficients.copy(), start.trial, anew=True)
+        near = problem.begun(start.trial.coefficients.copy(), start.trial)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
             result = self._finished(points, start.prepared, self._from_rest(points, start.prepared), begin)
         else:
@@ -253,24 +256,32 @@ class Registrar:
 
     def _cold(self, points: Floats, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more from rest for each round of gathering them."""
-        prepared = self._everywhere
-        found = self._from_rest(points, prepared)
-        for _ in range(self.options.rounds):
+        prepared, rounds = self._everywhere, self.options.rounds
+        found = self._from_rest(points, prepared, is_last=rounds == 0)
+        for left in reversed(range(rounds)):
             if self._is_hopeless(found):
                 break
             inner = found.trial.coefficients[: prepared.forces.size]
             prepared = self._gathered(prepared.forces.forces(inner))
-            found = _after(found, self._from_rest(points, prepared))
+            found = _after(found, self._from_rest(points, prepared, is_last=left == 0))
         return self._finished(points, prepared, found, begin)
 
-    def _from_rest(self, points: Floats, prepared: Prepared) -> Found:
-        """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
-        solver, first = self.options.solver, prepared.leading(_LEADING)
-        rough, problem = self._plain(points, first), self._plain(points, prepared)
-        begun = solver.rough().solve(rough, np.zeros(rough.size))
+    def _from_rest(self, points: Floats, prepared: Prepared, *, is_last: bool = True) -> Found:
+        """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all.
+
+        Args:
+            points: the cloud, (p, 3), metres.
+            prepared: forces and model.
+            is_last: to the end and with all points, not just to find the place of the forces.
+        """
+        few, first = _thinned(points, self.options.few_points), prepared.leading(_LEADING)
+        rough = self._plain(few, first)
+        begun = self.options.solver.rough().solve(rough, np.zeros(rough.size))
+        problem = self._plain(points if is_last else few, prepared)
         start = np.zeros(problem.size)
         start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
         start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
+        solver = self.options.solver if is_last else self.options.solver.rough()
         if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
             solver = solver.without_steps()
         return _after(begun, solver.solve(problem, start, begun.trial))
@@ -338,7 +349,7 @@ class Registrar:
         points = np.asarray(cloud, dtype=np.float64)
         if points.ndim == 2 and points.shape[1:] == (3,):
             finite: Any = np.isfinite(points).all()
-            points = points[thinned(points, self.options.most_points)] if finite else points
+            points = _thinned(points, self.options.most_points) if finite else points
         if self.pose is not None and points.ndim == 2 and points.shape[1:] == (3,):
             check_cloud(self.pose.mean.inverse().apply(points), self.model.body)
             return points
@@ -423,6 +434,10 @@ def expected_force(body: Body, young_modulus: float) -> float:
     """Nodal force to begin with, newtons: 1 % of Young's modulus (Pa) over the square of a typical edge."""
     edge = float(np.median(edge_lengths(body.points, body.cells)))
     return 0.01 * young_modulus * edge**2
+
+
+def _thinned(points: Floats, most: int) -> Floats:
+    return points if len(points) <= most else points[thinned(points, most)]
 
 
 def _badness(result: Registration) -> tuple[int, float]:

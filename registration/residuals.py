@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,9 +64,20 @@ class SurfaceDistance:
         """
         positions = self.rest + displacement
         if near is None:
-            triangles, weights = self._closest.find(positions, cloud)
-        else:
-            triangles, weights = self._closest.follow(positions, cloud, near.triangles)
+            return self._matched(positions, cloud, *self._closest.find(positions, cloud))
+        return self._matched(positions, cloud, *self._closest.follow(positions, cloud, near.triangles))
+
+    def match_nearby(self, displacement: Floats, cloud: Floats) -> Match:
+        """The same by a walk from each point's nearest vertex: faster than anew, in rare places not the closest.
+
+        Args:
+            displacement: of the nodes `nodes`, (m, 3), metres.
+            cloud: points, (p, 3), metres.
+        """
+        positions = self.rest + displacement
+        return self._matched(positions, cloud, *self._closest.near(positions, cloud))
+
+    def _matched(self, positions: Floats, cloud: Floats, triangles: Ints, weights: Floats) -> Match:
         corners = positions[self.triangles[triangles]]
         offsets = np.einsum("pk,pki->pi", weights, corners) - cloud
         lengths = np.sqrt(np.einsum("pi,pi->p", offsets, offsets))
@@ -93,6 +105,7 @@ class SurfaceDistance:
         indptr = np.arange(0, 9 * count + 1, 9)
         return csr_array((values.ravel(), columns.ravel(), indptr), shape=(count, 3 * len(self.nodes)))
 
+    @cached_property
     def normals(self) -> tuple[Floats, Floats]:
         """Normal, (m, 3), and share of the observed side's area, (m,), of each observed node at rest."""
         corners = self.rest[self.triangles]

@@ -30,33 +30,37 @@ class Forces:
 
     Args:
         nodes: nodes that may carry force, (a,).
-        basis: nodal forces of each coefficient, (3n, k), dimensionless: coefficients are in newtons.
+        patterns: forces at these nodes for each coefficient, (3a, k), dimensionless: coefficients are in newtons.
+        count: number of nodes of the body, n.
         scale: what is believed of the coefficients' standard deviation, newtons.
         left_out: covariance of the net force of directions that were left out, for unit scale, (3, 3).
-        every: the basis before any direction was left out, (3n, m).
-        where: part of its expected size that a force at each node may have, (n,); None for the whole of it.
+        every: the patterns before any direction was left out, (3a, m); None where none was.
     """
 
     nodes: Ints
-    basis: Floats
+    patterns: Floats
+    count: int
     scale: Scale = FORCE
     left_out: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     every: Floats | None = None
-    where: Floats | None = None
 
     @property
     def size(self) -> int:
         """Number of coefficients, k."""
-        return self.basis.shape[1]
+        return self.patterns.shape[1]
 
-    @property
-    def directions(self) -> int:
-        """How many directions there were before any was left out."""
-        return self.size if self.every is None else self.every.shape[1]
+    @cached_property
+    def basis(self) -> Floats:
+        """Forces at all nodes of the body for each coefficient, (3n, k)."""
+        whole = np.zeros((self.count, 3, self.size))
+        whole[self.nodes] = self.patterns.reshape(-1, 3, self.size)
+        return whole.reshape(-1, self.size)
 
     def forces(self, coefficients: Floats) -> Floats:
         """Nodal forces, (n, 3), newtons."""
-        return (self.basis @ coefficients).reshape(-1, 3)
+        whole = np.zeros((self.count, 3))
+        whole[self.nodes] = (self.patterns @ coefficients).reshape(-1, 3)
+        return whole
 
     def combined(self, kept: Floats) -> Forces:
         """The forces in orthonormal combinations of their directions; the net force of the others is left in doubt.
@@ -65,17 +69,22 @@ class Forces:
             kept: combinations, (k, kept).
         """
         rest = self.net_basis - (self.net_basis @ kept) @ kept.T
-        every = self.basis if self.every is None else self.every
-        return replace(self, basis=self.basis @ kept, left_out=self.left_out + rest @ rest.T, every=every)
+        every = self.patterns if self.every is None else self.every
+        return replace(self, patterns=self.patterns @ kept, left_out=self.left_out + rest @ rest.T, every=every)
 
     def leading(self, count: int) -> Forces:
         """The first directions alone: those that move the observed side most, where they were reduced."""
-        return replace(self, basis=self.basis[:, :count])
+        return replace(self, patterns=self.patterns[:, :count])
 
-    @property
+    @cached_property
     def net_basis(self) -> Floats:
         """Net force of each coefficient, (3, k)."""
-        return self.basis.reshape(-1, 3, self.size).sum(axis=0)
+        return _net(self.patterns)
+
+
+def _net(patterns: Floats) -> Floats:
+    summed: Floats = patterns.reshape(-1, 3, patterns.shape[1]).sum(axis=0)
+    return summed
 
 
 def nodal_forces(body: Body, nodes: ArrayLike, scale: Scale = FORCE, smoothness: float = 0.0) -> Forces:
@@ -102,10 +111,7 @@ def nodal_forces(body: Body, nodes: ArrayLike, scale: Scale = FORCE, smoothness:
             "give the zone that the tool may touch."
         )
     root = _correlation_root(body.points[chosen], smoothness)
-    basis = np.zeros((len(body.points), 3, 3 * root.shape[1]))
-    for axis in range(3):
-        basis[chosen, axis, axis::3] = root
-    return Forces(chosen, basis.reshape(-1, 3 * root.shape[1]), scale)
+    return Forces(chosen, np.kron(root, np.eye(3)), len(body.points), scale)
 
 
 def _correlation_root(positions: Floats, smoothness: float) -> Floats:
@@ -152,7 +158,8 @@ def told(model: ReducedModel, observed: SurfaceDistance, rule: Informed) -> Floa
     moved = model.solve(np.zeros(model.count)).jacobian(_observing_rows(observed))
     squares, vectors = np.linalg.eigh(moved.T @ moved)
     information = squares[::-1] * (rule.scale / rule.noise) ** 2 * rule.points
-    return vectors[:, ::-1][:, : min(rule.most, max(int((information > rule.information).sum()), 1))]
+    count = min(rule.most, max(int((information > rule.information).sum()), 1))
+    return np.ascontiguousarray(vectors[:, ::-1][:, :count])
 
 
 def windowed(forces: Forces, where: Floats) -> Forces:
@@ -162,11 +169,19 @@ def windowed(forces: Forces, where: Floats) -> Forces:
         forces: forces of which nothing is known of their place.
         where: part of its expected size that a force at each node may have, (n,).
     """
-    rows = np.repeat(where, 3)[:, None]
-    every = rows * (forces.basis if forces.every is None else forces.every)
-    basis = rows * forces.basis
-    whole, kept = (columns.reshape(-1, 3, columns.shape[1]).sum(axis=0) for columns in (every, basis))
-    return replace(forces, basis=basis, left_out=whole @ whole.T - kept @ kept.T, every=every, where=where)
+    parts = np.repeat(where[forces.nodes], 3)
+    patterns = parts[:, None] * forces.patterns
+    every = forces.patterns if forces.every is None else forces.every
+    whole, kept = _parted_net(parts, every), _net(patterns)
+    return replace(forces, patterns=patterns, left_out=whole @ whole.T - kept @ kept.T, every=None)
+
+
+def _parted_net(parts: Floats, patterns: Floats) -> Floats:
+    """Net force of each pattern times its nodes' parts, (3, k), with no copy of the patterns."""
+    axes = np.zeros((3, len(parts)))
+    for axis in range(3):
+        axes[axis, axis::3] = parts[axis::3]
+    return axes @ patterns
 
 
 def contact(forces: Forces, nodal: Floats, positions: Floats, reach: float, least: float = 0.02) -> Floats:
@@ -192,7 +207,7 @@ def contact(forces: Forces, nodal: Floats, positions: Floats, reach: float, leas
 
 def _observing_rows(observed: SurfaceDistance) -> csr_array:
     """Root mean square movement of the observed side as rows, (3m, 3m): along the normal, and less across it."""
-    normals, share = observed.normals()
+    normals, share = observed.normals
     count = len(normals)
     blocks = _TANGENTIAL * np.eye(3) + (1.0 - _TANGENTIAL) * normals[:, :, None] * normals[:, None, :]
     blocks *= np.sqrt(share)[:, None, None]
@@ -268,10 +283,9 @@ class ModelError:
         """Standard deviation of an observed node's distance by what the modes leave out, (p,), metres."""
         return self.size * self.left_out
 
-    @cached_property
-    def modes(self) -> Floats:
-        """Change of the observed nodes by each unknown, (3p, m), metres."""
-        return self.size * self.observed
+    def jacobian(self, rows: csr_array | Floats) -> Floats:
+        """Derivative of linear functions of the observed nodes' displacement, (q, m), for rows (q, 3p)."""
+        return self.size * (rows @ self.observed)
 
     def field(self, coefficients: Floats) -> Floats:
         """What is to be added to the model's displacement, (n, 3), metres."""
@@ -279,4 +293,4 @@ class ModelError:
 
     def observed_field(self, coefficients: Floats, every: int = 1) -> Floats:
         """The same at the observed nodes alone, one of so many, (p, 3)."""
-        return self.modes.reshape(-1, 3, self.count)[::every] @ coefficients
+        return self.observed.reshape(-1, 3, self.count)[::every] @ (self.size * coefficients)

@@ -32,7 +32,7 @@ def relative_errors(surrogate: Surrogate, data: DataSet, samples: Samples) -> Fl
     return missing
 
 
-def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 64) -> Surrogate:
+def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 32) -> Surrogate:
     """The surrogate with the patterns of its errors on the validation samples: see `Discrepancy`.
 
     What the patterns leave out is measured on samples that they were not made from. Of fewer than four samples nothing

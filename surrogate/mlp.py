@@ -60,8 +60,11 @@ class PerceptronCore:
         """Number of hidden layers."""
         return (len(self.weights) - 1) // 2
 
-    def evaluate(self, coordinates: Floats) -> tuple[Floats, Any]:
-        """Last hidden values, (3n,), for first ones before their bias, (3n,), and a record for `push` and `pull`."""
+    def evaluate(self, coordinates: Floats, *, single: bool = False) -> tuple[Floats, Any]:
+        """Last hidden values, (3n,), for first ones before their bias, (3n,), and a record for `push` and `pull`.
+
+        Always in double precision.
+        """
         z = coordinates + self.weights["first.bias"]
         active = [z > 0.0]
         for i in range(self.depth):

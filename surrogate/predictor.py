@@ -49,8 +49,8 @@ class Core(Protocol):
         """What to store."""
         ...
 
-    def evaluate(self, coordinates: Floats) -> tuple[Floats, Any]:
-        """Values, and a record that the derivatives go on from."""
+    def evaluate(self, coordinates: Floats, *, single: bool = False) -> tuple[Floats, Any]:
+        """Values, and a record that the derivatives go on from; `single`: 1e-6 will do."""
         ...
 
     def push(self, record: Any, tangents: Floats, *, single: bool = False) -> Floats:
@@ -131,14 +131,17 @@ class SurrogateState:
         surrogate: the surrogate.
         coordinates: of the load, that the network takes, (d,).
         linear: linear part of the displacement, (3n,), metres.
+        found: what the network says of the coordinates, where it has been asked.
     """
 
     negative_pivots: int | None = None  # a network has no tangent to count them of
 
-    def __init__(self, surrogate: Surrogate, coordinates: Floats, linear: Floats) -> None:
+    def __init__(
+        self, surrogate: Surrogate, coordinates: Floats, linear: Floats, found: tuple[Floats, Any] | None = None
+    ) -> None:
         frame = surrogate.frame
         self._surrogate, self.coordinates = surrogate, coordinates
-        values, self._record = surrogate.core.evaluate(coordinates)
+        values, self._record = surrogate.core.evaluate(coordinates) if found is None else found
         self.displacement: Floats = (frame.offset + linear + frame.decode @ values).reshape(-1, 3)
 
     @property
@@ -285,7 +288,7 @@ def _tangent(core: Core, record: Any, columns: Floats, *, single: bool = False) 
 
 
 class ReducedSurrogateState:
-    """What a reduced surrogate predicts for one set of coefficients: a value; derivatives are good to 1e-6.
+    """What a reduced surrogate predicts for one set of coefficients: a value, good to 1e-6.
 
     Args:
         model: the reduced surrogate.
@@ -293,24 +296,26 @@ class ReducedSurrogateState:
     """
 
     def __init__(self, model: ReducedSurrogate, coefficients: Floats) -> None:
-        self._model, self.coefficients = model, coefficients
-        self._values, self._record = model.surrogate.core.evaluate(model.encode @ coefficients)
-        rows = model.offset_rows + model.linear_rows @ coefficients + model.decode_rows @ self._values
-        self.positions: Floats = rows.reshape(-1, 3)
+        self.model, self.coefficients = model, coefficients
+        self._found = model.surrogate.core.evaluate(model.encode @ coefficients, single=True)
+        moved = model.offset_rows + model.rows @ np.concatenate([coefficients, self._found[0]])
+        self.positions: Floats = moved.reshape(-1, 3)
 
     @cached_property
     def full(self) -> SurrogateState:
         """The whole state."""
-        model = self._model
-        return SurrogateState(model.surrogate, model.encode @ self.coefficients, model.linear @ self.coefficients)
+        model = self.model
+        coordinates = model.encode @ self.coefficients
+        return SurrogateState(model.surrogate, coordinates, model.linear(self.coefficients), self._found)
 
     @cached_property
     def _tangent(self) -> Floats:
-        return _tangent(self._model.surrogate.core, self._record, self._model.encode, single=True)
+        return _tangent(self.model.surrogate.core, self._found[1], self.model.encode, single=True)
 
     def jacobian(self, rows: csr_array) -> Floats:
         """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p); no more is touched."""
-        return rows @ self._model.linear_rows + (rows @ self._model.decode_rows) @ self._tangent
+        both, count = rows @ self.model.rows, self.model.count
+        return both[:, :count] + both[:, count:] @ self._tangent
 
     def moved(self, change: Floats, every: int = 1) -> Floats:
         """First-order displacement of the chosen nodes, (p, 3), for a change of the coefficients, (k,).
@@ -319,10 +324,8 @@ class ReducedSurrogateState:
             change: of the coefficients.
             every: of so many nodes one, the first of all to begin with.
         """
-        linear, decode = (
-            rows.reshape(-1, 3, rows.shape[1])[::every] for rows in (self._model.linear_rows, self._model.decode_rows)
-        )
-        return linear @ change + decode @ (self._tangent @ change)
+        some = self.model.rows.reshape(-1, 3, self.model.rows.shape[1])[::every]
+        return some @ np.concatenate([change, self._tangent @ change])
 
 
 class ReducedSurrogate:
@@ -337,11 +340,11 @@ class ReducedSurrogate:
     def __init__(self, surrogate: Surrogate, nodes: Ints, basis: Floats) -> None:
         frame = surrogate.frame
         picked = (3 * nodes[:, None] + np.arange(3)).ravel()
-        self.surrogate, self._picked = surrogate, picked
+        self.surrogate = surrogate
         self.encode = frame.encode @ basis
-        self.linear = frame.linear(basis)
-        self.linear_rows = np.ascontiguousarray(self.linear[picked])
-        self.decode_rows = np.ascontiguousarray(frame.decode[picked])
+        self._linear, self._combination = frame.linear(basis), np.eye(basis.shape[1])
+        self._linear_rows, self._decode_rows = self._linear[picked], frame.decode[picked]
+        self.rows = np.hstack([self._linear_rows, self._decode_rows])  # by the coefficients and by what the core says
         self.offset_rows = frame.offset[picked]
 
     @property
@@ -352,12 +355,17 @@ class ReducedSurrogate:
     def combined(self, matrix: Floats) -> ReducedSurrogate:
         """The same for the basis times a matrix, (k, j), for the price of some small products."""
         other = copy(self)
-        other.encode, other.linear = self.encode @ matrix, self.linear @ matrix
-        other.linear_rows = np.ascontiguousarray(other.linear[self._picked])
+        other.encode, other._combination = self.encode @ matrix, self._combination @ matrix
+        other._linear_rows = self._linear_rows @ matrix
+        other.rows = np.hstack([other._linear_rows, self._decode_rows])
         return other
 
+    def linear(self, coefficients: Floats) -> Floats:
+        """Linear part of the displacement of all nodes, (3n,), metres."""
+        return self._linear @ (self._combination @ coefficients)
+
     def solve(self, coefficients: ArrayLike, near: Any = None) -> ReducedSurrogateState:
-        """The state for force coefficients, (k,); `near` is of no use here.
+        """The state for force coefficients, (k,): `near` itself where it is that.
 
         Raises:
             ValueError: another shape.
@@ -365,6 +373,8 @@ class ReducedSurrogate:
         c = np.asarray(coefficients, dtype=np.float64)
         if c.shape != (self.encode.shape[1],):
             raise ValueError(f"coefficients: expected shape ({self.encode.shape[1]},), got {c.shape}.")
+        if isinstance(near, ReducedSurrogateState) and near.model is self and np.array_equal(near.coefficients, c):
+            return near
         return ReducedSurrogateState(self, c)
 
 
