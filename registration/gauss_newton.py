@@ -106,6 +106,10 @@ class GaussNewton:
         few = min(self.max_iterations, _ROUGH)
         return replace(self, losses=self.losses[:1], settled=self.handed_on, max_iterations=few)
 
+    def last(self) -> GaussNewton:
+        """The same with the last loss alone: from where all have been."""
+        return replace(self, losses=self.losses[-1:])
+
     def without_steps(self) -> GaussNewton:
         """The same, which takes any start for the end: to judge it."""
         return replace(self, losses=self.losses[:1], settled=1e9, handed_on=1e9, graduation=0.0)

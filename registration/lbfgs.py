@@ -47,6 +47,10 @@ class LBFGS:
         """The same with the first loss alone: for a start."""
         return replace(self, losses=self.losses[:1])
 
+    def last(self) -> LBFGS:
+        """The same with the last loss alone: from where all have been."""
+        return replace(self, losses=self.losses[-1:])
+
     def without_steps(self) -> LBFGS:
         """The same with one short run: to judge a start."""
         return replace(self, losses=self.losses[:1], max_iterations=1)

@@ -281,7 +281,7 @@ class Registrar:
         start = np.zeros(problem.size)
         start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
         start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
-        solver = self.options.solver if is_last else self.options.solver.rough()
+        solver = self.options.solver
         if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
             solver = solver.without_steps()
         return _after(begun, solver.solve(problem, start, begun.trial))
@@ -321,7 +321,7 @@ class Registrar:
             problem = replace(problem, error=replace(problem.error, size=factor * problem.error.size))
             start = found.trial.coefficients.copy()
             start[problem.error_part] /= factor
-            again = self.options.solver.solve(problem, start, found.trial)
+            again = self.options.solver.last().solve(problem, start, found.trial)
             found = _after(found, again)
         return problem, found, doubt
 
