@@ -294,5 +294,5 @@ def _registered(sequence: twins.Sequence, cloud: CloudFile | ArrayLike) -> Frame
     try:
         points = cloud.read()
     except FileError as error:  # it could be read a moment ago, or holds nothing to register
-        return sequence.refuse(str(error))
+        return sequence.refuse(str(error).removeprefix(f"{cloud.path}: "))  # the frame says which file it is
     return sequence.register(points)

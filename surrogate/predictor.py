@@ -131,17 +131,14 @@ class SurrogateState:
         surrogate: the surrogate.
         coordinates: of the load, that the network takes, (d,).
         linear: linear part of the displacement, (3n,), metres.
-        found: what the network says of the coordinates, where it has been asked.
     """
 
     negative_pivots: int | None = None  # a network has no tangent to count them of
 
-    def __init__(
-        self, surrogate: Surrogate, coordinates: Floats, linear: Floats, found: tuple[Floats, Any] | None = None
-    ) -> None:
+    def __init__(self, surrogate: Surrogate, coordinates: Floats, linear: Floats) -> None:
         frame = surrogate.frame
         self._surrogate, self.coordinates = surrogate, coordinates
-        values, self._record = surrogate.core.evaluate(coordinates) if found is None else found
+        values, self._record = surrogate.core.evaluate(coordinates)
         self.displacement: Floats = (frame.offset + linear + frame.decode @ values).reshape(-1, 3)
 
     @property
@@ -303,10 +300,10 @@ class ReducedSurrogateState:
 
     @cached_property
     def full(self) -> SurrogateState:
-        """The whole state."""
+        """The whole state, in double precision."""
         model = self.model
         coordinates = model.encode @ self.coefficients
-        return SurrogateState(model.surrogate, coordinates, model.linear(self.coefficients), self._found)
+        return SurrogateState(model.surrogate, coordinates, model.linear(self.coefficients))
 
     @cached_property
     def _tangent(self) -> Floats:

@@ -81,6 +81,15 @@ def test_following_finds_what_searching_finds(body: Body, rng) -> None:
     assert np.isclose(*lengths, atol=1e-12).mean() > 0.9
 
 
+def test_the_nearest_vertex_leads_to_the_closest_point(body: Body, observed: SurfaceDistance, rng) -> None:
+    """Of points near the surface; those that it does not lead there are farther off than the closest, never nearer."""
+    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement[observed.nodes]
+    cloud = cloud_on(body, Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement, 300, rng, 1e-3)
+    nearby, exact = (np.abs(found(truth, cloud).distances) for found in (observed.match_nearby, observed.match))
+    assert (nearby >= exact - 1e-12).all()
+    assert np.isclose(nearby, exact, atol=1e-12).mean() > 0.97
+
+
 def test_the_closest_point_of_a_triangle_lies_in_it(rng) -> None:
     corners, points = rng.standard_normal((500, 3, 3)), 3.0 * rng.standard_normal((500, 3))
     weights, squares = closest_in_triangles(corners, points)

@@ -93,14 +93,22 @@ def test_the_reduced_surrogate_agrees_with_the_whole(surrogate: Surrogate, force
     few = surrogate.reduced(nodes, basis).solve(c)
     whole = surrogate.solve((basis @ c).reshape(-1, 3))
     pushed = whole.push(basis).reshape(-1, 3, 4)[nodes].reshape(-1, 4)
-    tolerance = 1e-11 * np.abs(whole.displacement).max()
-    assert np.abs(few.positions - whole.displacement[nodes]).max() < tolerance
-    assert np.abs(few.full.displacement - whole.displacement).max() < tolerance
+    size = np.abs(whole.displacement).max()
+    assert np.abs(few.full.displacement - whole.displacement).max() < 1e-11 * size
+    # The rest is taken in single precision.
+    assert np.abs(few.positions - whole.displacement[nodes]).max() < 1e-6 * size
     rows = csr_array(np.random.default_rng(3).standard_normal((5, 9)))
-    # Derivatives of the reduced network are taken in single precision.
     assert np.abs(few.jacobian(rows) - rows @ pushed).max() < 1e-5 * np.abs(rows @ pushed).max()
     assert np.abs(few.moved(c).ravel() - pushed @ c).max() < 1e-5 * np.abs(pushed @ c).max()
     np.testing.assert_allclose(few.moved(c, 2), few.moved(c)[::2], rtol=1e-12)
+
+
+def test_a_known_state_is_not_computed_again(surrogate: Surrogate, forces: np.ndarray) -> None:
+    few = surrogate.reduced(np.array([3, 17]), np.stack([forces.ravel(), -0.5 * forces.ravel()], axis=1))
+    state = few.solve(np.array([0.3, 0.1]))
+    assert few.solve(np.array([0.3, 0.1]), state) is state
+    assert few.solve(np.array([0.3, 0.2]), state) is not state
+    assert few.combined(np.eye(2)).solve(np.array([0.3, 0.1]), state) is not state
 
 
 def test_a_reduced_surrogate_takes_combinations_of_its_basis(surrogate: Surrogate, forces: np.ndarray) -> None:
