@@ -27,12 +27,13 @@ from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import (
     NOISE,
+    Gathering,
     Registrar,
     Registration,
     RegistrationOptions,
     expected_force,
+    gathering_for,
     prepare,
-    rounds_for,
 )
 from softtwin.registration.rigid import align
 from softtwin.registration.thinning import thinned
@@ -284,7 +285,7 @@ class Twin:
             force_scale=section.force_scale or expected_force(body, self.config.material.young_modulus),
             smoothness=section.smoothness,
             directions=section.directions,
-            options=_options(section, rounds_for(self.model, bool(zone))),
+            options=_options(section, gathering_for(self.model, bool(zone))),
         )
 
 
@@ -338,13 +339,15 @@ class Sequence:
         return self._count - 1
 
 
-def _options(section: RegistrationSection, rounds: int) -> RegistrationOptions:
+def _options(section: RegistrationSection, gathering: Gathering) -> RegistrationOptions:
     spread = 0.0 if section.noise_known else NOISE.spread
     noise = Scale(section.noise, spread, least=min(NOISE.least, section.noise))
     solver = LBFGS() if section.solver == "l-bfgs" else GaussNewton()
     if section.max_iterations:
         solver = replace(solver, max_iterations=section.max_iterations)
-    return RegistrationOptions(noise, solver, section.points, rounds if section.rounds < 0 else section.rounds)
+    if section.rounds >= 0:
+        gathering = replace(gathering, rounds=section.rounds)
+    return RegistrationOptions(noise, solver, section.points, gathering)
 
 
 def with_options(config: Config, options: dict[str, Any]) -> Config:

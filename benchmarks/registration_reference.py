@@ -19,7 +19,13 @@ from softtwin.reference.equilibrium import NewtonOptions, Problem
 from softtwin.reference.materials import NeoHookean
 from softtwin.reference.model import ReferenceModel
 from softtwin.registration.forward import ForwardModel
-from softtwin.registration.registrar import RegistrationOptions, expected_force, prepare, register_sequence
+from softtwin.registration.registrar import (
+    RegistrationOptions,
+    expected_force,
+    gathering_for,
+    prepare,
+    register_sequence,
+)
 
 
 def run(
@@ -91,7 +97,6 @@ def main() -> None:
     parser.add_argument("--sequences", nargs="+", default=list(SEQUENCES))
     arguments = parser.parse_args()
     body = liver(arguments.mesh, arguments.attachment)
-    options = RegistrationOptions(rounds=0)  # the zone is known
     figures = {
         "smoothness": arguments.smoothness,
         "mesh": arguments.mesh,
@@ -103,6 +108,7 @@ def main() -> None:
         for name in arguments.sequences:
             data = sequence(name, arguments.mesh)
             model = ReferenceModel(problem, patient=False)
+            options = RegistrationOptions(gathering=gathering_for(model, has_zone=True))
             rows = run(data, model, arguments.frames, options, arguments.smoothness)
             figures["sequences"][name] = {"summary": summary(rows), "frames": rows}
             print(name, {key: round(value, 4) for key, value in summary(rows).items()}, flush=True)

@@ -34,8 +34,8 @@ from softtwin.registration.registrar import (
     Registration,
     RegistrationOptions,
     expected_force,
+    gathering_for,
     prepare,
-    rounds_for,
 )
 from softtwin.registration.unknowns import PosePrior
 
@@ -116,7 +116,7 @@ def registrar_for(
         zone,
         model.body.surfaces["observed"],
         force_scale=expected_force(model.body, YOUNG_MODULUS),
-        options=RegistrationOptions(rounds=rounds_for(model, zoned)),
+        options=RegistrationOptions(gathering=gathering_for(model, zoned)),
         pose=pose,
     )
 

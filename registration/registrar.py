@@ -38,8 +38,34 @@ _DOUBTS, _SURE = 3, 0.25  # times that the model's error is scaled anew; not whe
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
 _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
+_CLEAR = 2.0  # times the least noise
 _LEADING = 6  # directions of force that a cold start begins with
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
+
+
+@dataclass(frozen=True)
+class Gathering:
+    """How a cold start finds where forces act: they are expected again where a round before has found some.
+
+    Args:
+        rounds: how often.
+        anew: each round begins at rest and not where the one before ended: safer, and as many solves again.
+        above: clouds of less noise tell the place of the forces themselves, metres.
+        reach: forces within this part of the body's size are gathered together.
+        informed: which directions are kept of gathered forces.
+        points: so many of the cloud are enough, but for the last round.
+    """
+
+    rounds: int = 2
+    anew: bool = True
+    above: float = 0.0
+    reach: float = 0.035
+    informed: Informed = field(default_factory=Informed)
+    points: int = 300
+
+    def __post_init__(self) -> None:
+        if self.points < 1:
+            raise ValueError(f"Gathering.points: expected at least 1, got {self.points}.")
 
 
 @dataclass(frozen=True)
@@ -50,24 +76,17 @@ class RegistrationOptions:
         noise: what is believed of the standard deviation of a point's distance, metres; found from the cloud.
         solver: how the objective is minimised.
         most_points: larger clouds are thinned to so many points.
-        rounds: how often a cold start gathers the forces where it found some.
-        reach: forces within this part of the body's size are gathered together.
-        informed: which directions are kept of gathered forces.
-        few_points: so many are enough to find the place of the forces.
+        gathering: how a cold start finds where forces act.
     """
 
     noise: Scale = NOISE
     solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
     most_points: int = 1000
-    rounds: int = 2
-    reach: float = 0.035
-    informed: Informed = field(default_factory=Informed)
-    few_points: int = 300
+    gathering: Gathering = field(default_factory=Gathering)
 
     def __post_init__(self) -> None:
-        for name in ("most_points", "few_points"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"RegistrationOptions.{name}: expected at least 1, got {getattr(self, name)}.")
+        if self.most_points < 1:
+            raise ValueError(f"RegistrationOptions.most_points: expected at least 1, got {self.most_points}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +234,7 @@ class Registrar:
             found = self.options.solver.solve(problem, near.coefficients, near)
             problem, found, doubt = self._doubted(problem, found, start.doubt)
             result = self._result(problem, found, start.prepared, begin, doubt)
-        if self.options.rounds and self._has_left(result, start):
+        if start.prepared is not self._everywhere and self._has_left(result, start):
             return self._cold(points, begin)
         return result
 
@@ -255,15 +274,21 @@ class Registrar:
         return replace(plain, error=error, noise=self.options.noise)
 
     def _cold(self, points: Floats, begin: float) -> Registration:
-        """From rest; where the place of the forces is unknown, once more from rest for each round of gathering them."""
-        prepared, rounds = self._everywhere, self.options.rounds
-        found = self._from_rest(points, prepared, is_last=rounds == 0)
-        for left in reversed(range(rounds)):
-            if self._is_hopeless(found):
+        """From rest; where the place of the forces is unknown, once more for each round of gathering them."""
+        prepared, gathering = self._everywhere, self.options.gathering
+        found = self._from_rest(points, prepared, is_last=gathering.rounds == 0 or not gathering.anew)
+        for left in reversed(range(gathering.rounds)):
+            if self._is_hopeless(found) or found.posterior.scales.noise < gathering.above:
                 break
-            inner = found.trial.coefficients[: prepared.forces.size]
-            prepared = self._gathered(prepared.forces.forces(inner))
-            found = _after(found, self._from_rest(points, prepared, is_last=left == 0))
+            size = prepared.forces.size
+            nodal = prepared.forces.forces(found.trial.coefficients[:size])
+            prepared = self._gathered(nodal)
+            if gathering.anew:
+                again = self._from_rest(points, prepared, is_last=left == 0)
+            else:
+                start = np.concatenate([prepared.forces.nearest(nodal), found.trial.coefficients[size:]])
+                again = self.options.solver.solve(self._plain(points, prepared), start, found.trial)
+            found = _after(found, again)
         return self._finished(points, prepared, found, begin)
 
     def _from_rest(self, points: Floats, prepared: Prepared, *, is_last: bool = True) -> Found:
@@ -274,7 +299,7 @@ class Registrar:
             prepared: forces and model.
             is_last: to the end and with all points, not just to find the place of the forces.
         """
-        few, first = _thinned(points, self.options.few_points), prepared.leading(_LEADING)
+        few, first = _thinned(points, self.options.gathering.points), prepared.leading(_LEADING)
         rough = self._plain(few, first)
         begun = self.options.solver.rough().solve(rough, np.zeros(rough.size))
         problem = self._plain(points if is_last else few, prepared)
@@ -328,9 +353,9 @@ class Registrar:
     def _gathered(self, nodal: Floats) -> Prepared:
         """The unknown forces once more, where forces were found."""
         body = self.model.body
-        where = contact(self.forces, nodal, body.points, self.options.reach * body.size)
+        where = contact(self.forces, nodal, body.points, self.options.gathering.reach * body.size)
         every = Prepared.of(self.model, self.observed, windowed(self.forces, where))
-        return every.informed(self.observed, self.options.informed)
+        return every.informed(self.observed, self.options.gathering.informed)
 
     def _is_nearer_at_rest(self, near: Trial, start: Registration) -> bool:
         """True where a cloud lies nearer to the body at rest than to what the last frame has found."""
@@ -404,7 +429,7 @@ def prepare(
         force_scale: size of a nodal force to begin with, newtons; see `expected_force`.
         smoothness: correlation length of neighbouring forces, metres; 0 for none.
         directions: most directions of force kept.
-        options: noise, solver, thinning, rounds.
+        options: noise, solver, thinning, search for the place of the forces.
         pose: prior of the pose; None for clouds in the body's coordinates.
 
     Raises:
@@ -420,14 +445,16 @@ def prepare(
     return Registrar(model, observed, forces, options, pose=pose)
 
 
-def rounds_for(model: ForwardModel, has_zone: bool) -> int:
-    """How often a cold start gathers the forces: not where an exact model is told their place, and solves are dear.
+def gathering_for(model: ForwardModel, has_zone: bool) -> Gathering:
+    """How forces are gathered: a learned model's solves are cheap, an exact one goes on from what it has.
 
     Args:
         model: forward model.
         has_zone: the nodes that may carry force are those that a tool can touch.
     """
-    return 0 if has_zone and model.error == 0.0 else 2
+    if model.error > 0.0:
+        return Gathering()
+    return Gathering(rounds=1, anew=False, above=_CLEAR * NOISE.least) if has_zone else Gathering(anew=False)
 
 
 def expected_force(body: Body, young_modulus: float) -> float:

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from softtwin.meshes.body import Body
-from softtwin.registration.registrar import RegistrationOptions, prepare
+from softtwin.registration.registrar import Gathering, RegistrationOptions, gathering_for, prepare
 
 from .conftest import cloud_on, seen_from_above
 
@@ -54,8 +54,9 @@ class Springs:
         return SpringState(self.inverse @ np.asarray(forces), self.inverse)
 
 
+@pytest.mark.parametrize("anew", [True, False])
 @pytest.mark.parametrize("noise", [3e-4, 2e-3])
-def test_gathering_finds_the_place_and_the_state(rng, noise: float) -> None:
+def test_gathering_finds_the_place_and_the_state(rng, noise: float, anew: bool) -> None:
     body = seen_from_above((12, 4, 4))
     model = Springs(body)
     observed = np.unique(body.surfaces["observed"])
@@ -68,14 +69,14 @@ def test_gathering_finds_the_place_and_the_state(rng, noise: float) -> None:
     truth = model.solve(forces).displacement
     cloud = cloud_on(body, truth, 500, rng, noise)
     errors, shares = [], []
-    for rounds in (0, 3):
+    for gathering in (Gathering(rounds=0), Gathering(rounds=3, anew=anew)):
         made = prepare(
             model,
             body.boundary_nodes,
             body.surfaces["observed"],
             force_scale=1e-2,
             smoothness=0.08,
-            options=RegistrationOptions(rounds=rounds),
+            options=RegistrationOptions(gathering=gathering),
         )
         result = made.register(cloud)
         # Along its own length a straight side slides freely: what is seen is what must be found.
@@ -87,3 +88,23 @@ def test_gathering_finds_the_place_and_the_state(rng, noise: float) -> None:
     assert shares[1] > 0.85 and shares[1] > shares[0]
     assert errors[1] < 0.1 * np.linalg.norm(truth, axis=1).mean()
     assert errors[1] < errors[0] + 1e-4
+
+
+def test_a_clear_cloud_needs_no_gathering(rng) -> None:
+    """Where the zone of an exact model is known: the forces gathered would be a belief beside what is seen."""
+    body = seen_from_above((12, 4, 4))
+    model = Springs(body)
+    seen = np.unique(body.surfaces["observed"])
+    tip = seen[body.points[seen, 0] > 0.7 * body.points[:, 0].max()]
+    forces = np.zeros_like(body.points)
+    forces[tip] = np.array([0.0, 0.3, 0.7]) / len(tip)
+    made = prepare(
+        model,
+        tip,
+        body.surfaces["observed"],
+        force_scale=1e-2,
+        options=RegistrationOptions(gathering=gathering_for(model, has_zone=True)),
+    )
+    truth = model.solve(forces).displacement
+    everywhere = [made.register(cloud_on(body, truth, 500, rng, noise)).prepared.forces for noise in (0.0, 2e-3)]
+    assert everywhere[0] is made.forces and everywhere[1] is not made.forces
