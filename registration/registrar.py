@@ -38,6 +38,7 @@ _DOUBTS, _SURE = 3, 0.25  # times that the model's error is scaled anew; not whe
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
 _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
+_MANY = 10_000  # points: of no cloud that is left after thinning are there more
 _CLEAR = 2.0  # times the least noise
 _LEADING = 6  # directions of force that a cold start begins with
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
@@ -274,35 +275,34 @@ class Registrar:
         return replace(plain, error=error, noise=self.options.noise)
 
     def _cold(self, points: Floats, begin: float) -> Registration:
-        """From rest; where the place of the forces is unknown, once more for each round of gathering them."""
+        """From rest; where the place of the forces is unknown, on from there for each round of gathering them."""
         prepared, gathering = self._everywhere, self.options.gathering
-        found = self._from_rest(points, prepared, is_last=gathering.rounds == 0 or not gathering.anew)
+        few = _thinned(points, gathering.points)
+        found = self._from_rest(few if gathering.rounds else points, prepared)
         for left in reversed(range(gathering.rounds)):
             if self._is_hopeless(found) or found.posterior.scales.noise < gathering.above:
                 break
-            size = prepared.forces.size
+            size, some = prepared.forces.size, few if left else points
             nodal = prepared.forces.forces(found.trial.coefficients[:size])
             prepared = self._gathered(nodal)
-            if gathering.anew:
-                again = self._from_rest(points, prepared, is_last=left == 0)
-            else:
-                start = np.concatenate([prepared.forces.nearest(nodal), found.trial.coefficients[size:]])
-                again = self.options.solver.solve(self._plain(points, prepared), start, found.trial)
-            found = _after(found, again)
+            found = _after(found, self._again(some, prepared, nodal, found.trial.coefficients[size:], found))
         return self._finished(points, prepared, found, begin)
 
-    def _from_rest(self, points: Floats, prepared: Prepared, *, is_last: bool = True) -> Found:
-        """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all.
+    def _again(self, points: Floats, prepared: Prepared, nodal: Floats, others: Floats, found: Found) -> Found:
+        """With gathered forces: from rest, or where that is dear from the nodal forces and other unknowns found."""
+        if self.options.gathering.anew:
+            return self._from_rest(points, prepared)
+        start = np.concatenate([prepared.forces.nearest(nodal), others])
+        try:
+            return self.options.solver.solve(self._plain(points, prepared), start, found.trial)
+        except NotConverged:
+            return self._from_rest(points, prepared)
 
-        Args:
-            points: the cloud, (p, 3), metres.
-            prepared: forces and model.
-            is_last: to the end and with all points, not just to find the place of the forces.
-        """
+    def _from_rest(self, points: Floats, prepared: Prepared) -> Found:
+        """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
         few, first = _thinned(points, self.options.gathering.points), prepared.leading(_LEADING)
-        rough = self._plain(few, first)
+        rough, problem = self._plain(few, first), self._plain(points, prepared)
         begun = self.options.solver.rough().solve(rough, np.zeros(rough.size))
-        problem = self._plain(points if is_last else few, prepared)
         start = np.zeros(problem.size)
         start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
         start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
@@ -312,16 +312,15 @@ class Registrar:
         return _after(begun, solver.solve(problem, start, begun.trial))
 
     def _finished(self, points: Floats, prepared: Prepared, found: Found, begin: float) -> Registration:
-        """With the model's error in patterns, from a result that took it for noise."""
-        problem, doubt = self._problem(points, prepared, found.trial), 1.0
-        if self.error is not None:
-            solver, is_hopeless = self.options.solver, self._is_hopeless(found)
-            if is_hopeless:
-                solver = solver.without_steps()
-            start = np.concatenate([found.trial.coefficients, np.zeros(self.error.count)])
+        """With all points, and with the model's error in patterns, from a result that took it for noise."""
+        problem, doubt, is_hopeless = self._problem(points, prepared, found.trial), 1.0, self._is_hopeless(found)
+        if self.error is not None or len(found.trial.cloud) < len(points):
+            solver = self.options.solver.without_steps() if is_hopeless else self.options.solver
+            errors = np.zeros(problem.size - len(found.trial.coefficients))
+            start = np.concatenate([found.trial.coefficients, errors])
             found = _after(found, solver.solve(problem, start, found.trial))
-            if not is_hopeless:
-                problem, found, doubt = self._doubted(problem, found, doubt)
+        if self.error is not None and not is_hopeless:
+            problem, found, doubt = self._doubted(problem, found, doubt)
         return self._result(problem, found, prepared, begin, doubt)
 
     def _is_hopeless(self, found: Found) -> bool:
@@ -446,7 +445,7 @@ def prepare(
 
 
 def gathering_for(model: ForwardModel, has_zone: bool) -> Gathering:
-    """How forces are gathered: a learned model's solves are cheap, an exact one goes on from what it has.
+    """How forces are gathered: an exact model's solves are dear, and a clear cloud tells it where a zone is pulled.
 
     Args:
         model: forward model.
@@ -454,7 +453,8 @@ def gathering_for(model: ForwardModel, has_zone: bool) -> Gathering:
     """
     if model.error > 0.0:
         return Gathering()
-    return Gathering(rounds=1, anew=False, above=_CLEAR * NOISE.least) if has_zone else Gathering(anew=False)
+    every = Gathering(anew=False, points=_MANY)
+    return replace(every, rounds=1, above=_CLEAR * NOISE.least) if has_zone else every
 
 
 def expected_force(body: Body, young_modulus: float) -> float:
