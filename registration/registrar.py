@@ -275,7 +275,7 @@ class Registrar:
         return replace(plain, error=error, noise=self.options.noise)
 
     def _cold(self, points: Floats, begin: float) -> Registration:
-        """From rest; where the place of the forces is unknown, on from there for each round of gathering them."""
+        """From rest; where the place of the forces is unknown, once more for each round of gathering them."""
         prepared, gathering = self._everywhere, self.options.gathering
         few = _thinned(points, gathering.points)
         found = self._from_rest(few if gathering.rounds else points, prepared)
