@@ -43,8 +43,12 @@ def liver_config(seconds: float, ranks: int) -> Config:
 
 def make_twin(seconds: float, ranks: int, folder: Path) -> Workspace:
     """The liver's twin; a data set that is there is not made again."""
-    space = prepare(liver_config(seconds, ranks), folder)
-    write_body(space.body, liver())
+    config = liver_config(seconds, ranks)
+    if (folder / "organ.toml").exists():  # its mesh came from no stage: `prepare` would not know it again
+        space = Workspace(config, folder)
+    else:
+        space = prepare(config, folder)
+        write_body(space.body, liver())
     generate_in_parallel(folder / "organ.toml", ranks)
     train_stage(space)
     print(validate_stage(space))
