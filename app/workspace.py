@@ -11,9 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .config import Config, read_config
+from filelock import FileLock, Timeout
+
+from .config import Config, ConfigError, read_config
 
 RECORDS = "stages.json"
+_PATIENCE_S = 2.0  # for a lock that is about to be let go
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,30 @@ def timed(space: Workspace, stage: str, read: Mapping[str, Any] | None = None) -
     begin = time.perf_counter()
     yield
     record_stage(space, stage, time.perf_counter() - begin, read)
+
+
+@contextmanager
+def locked(space: Workspace, stage: str) -> Iterator[None]:
+    """Keep others from the same stage in the same folder; the system lets go of the lock when the process ends.
+
+    Args:
+        space: the workspace.
+        stage: its name.
+
+    Raises:
+        ConfigError: another process is at it.
+    """
+    lock = FileLock(space.folder / f".{stage}.lock", timeout=_PATIENCE_S)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise ConfigError(
+            f"{space.folder}: another `{stage}` is at work here; wait for it, end it, or choose another folder."
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def record_stage(space: Workspace, stage: str, seconds: float, read: Mapping[str, Any] | None = None) -> None:

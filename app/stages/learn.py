@@ -18,7 +18,7 @@ from softtwin.surrogate.train import TrainingPlan, train
 
 from ..config import to_toml
 from ..inputs import check_trained, current_data, train_inputs, validate_inputs
-from ..workspace import Workspace, timed, write_whole
+from ..workspace import Workspace, locked, timed, write_whole
 
 
 def train_stage(space: Workspace, fresh: bool = False) -> Surrogate:
@@ -29,11 +29,16 @@ def train_stage(space: Workspace, fresh: bool = False) -> Surrogate:
         fresh: throw earlier checkpoints away instead.
 
     Raises:
-        ConfigError: there is no body, or one of another configuration.
+        ConfigError: there is no body, or one of another configuration; or another `train` is at work there.
         DataSetError: the data set is missing, damaged, not complete, or of another body or configuration.
         CheckpointError: the checkpoint is truncated, or of another plan or data set.
     """
     data, _ = current_data(space)
+    with locked(space, "train"):
+        return _train(space, data, fresh)
+
+
+def _train(space: Workspace, data: DataSet, fresh: bool) -> Surrogate:
     if fresh:
         shutil.rmtree(space.training, ignore_errors=True)
     section = space.config.training

@@ -21,7 +21,7 @@ from softtwin.app.cli import main
 from softtwin.app.config import Config, ConfigError, to_toml
 from softtwin.app.doctor import available_cores
 from softtwin.app.stages.learn import train_stage
-from softtwin.app.workspace import open_workspace, read_records, timed
+from softtwin.app.workspace import locked, open_workspace, read_records, timed
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_body, write_body
 from softtwin.meshes.shapes import beam
@@ -323,6 +323,7 @@ def test_ranks_end_together_with_one_message(
 
 
 def test_ranks_that_refuse_have_said_why(capsys, copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)  # one core starts no ranks
     monkeypatch.setattr(launch.shutil, "which", lambda name: name)
     monkeypatch.setattr(launch.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 2))
     said = run(capsys, "build", copy / "beam.vtu", "--fixed", copy / "fixed.txt", "--output", copy / "new", code=2)
@@ -354,3 +355,12 @@ def test_training_leaves_the_twin_whole(copy: Path) -> None:
         "surrogate.json",
         "surrogate.safetensors",
     }
+
+
+def test_two_trainings_in_one_folder_are_one_too_many(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("softtwin.app.workspace._PATIENCE_S", 0.1)
+    space = open_workspace(copy / "organ.toml")
+    with locked(space, "train"), pytest.raises(ConfigError, match=r"another `train` is at work here"):
+        train_stage(space)
+    with locked(space, "train"):
+        pass  # let go of
