@@ -453,8 +453,8 @@ def gathering_for(model: ForwardModel, has_zone: bool) -> Gathering:
     """
     if model.error > 0.0:
         return Gathering()
-    every = Gathering(anew=False, points=_MANY)
-    return replace(every, rounds=1, above=_CLEAR * NOISE.least) if has_zone else every
+    every = Gathering(points=_MANY)
+    return replace(every, rounds=1, anew=False, above=_CLEAR * NOISE.least) if has_zone else every
 
 
 def expected_force(body: Body, young_modulus: float) -> float:
