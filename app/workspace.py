@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from softtwin.reference import lock
 
 from .config import Config, ConfigError, read_config
 
 RECORDS = "stages.json"
-_PATIENCE_S = 2.0  # for a lock that is about to be let go
+_PATIENCE_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -98,17 +98,9 @@ def locked(space: Workspace, stage: str) -> Iterator[None]:
     Raises:
         ConfigError: another process is at it.
     """
-    lock = FileLock(space.folder / f".{stage}.lock", timeout=_PATIENCE_S)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise ConfigError(
-            f"{space.folder}: another `{stage}` is at work here; wait for it, end it, or choose another folder."
-        ) from None
-    try:
+    refusal = f"{space.folder}: another `{stage}` is at work here; wait for it, end it, or choose another folder."
+    with lock.locked(space.folder / f".{stage}.lock", ConfigError(refusal), _PATIENCE_S):
         yield
-    finally:
-        lock.release()
 
 
 def record_stage(space: Workspace, stage: str, seconds: float, read: Mapping[str, Any] | None = None) -> None:

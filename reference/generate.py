@@ -19,7 +19,6 @@ import mpi4py
 import numpy as np
 import scipy
 import zarr
-from filelock import FileLock, Timeout
 from mpi4py.futures import MPICommExecutor
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
@@ -41,6 +40,7 @@ from .dataset import (
 from .equilibrium import NewtonOptions, Problem
 from .fenicsx import MPI, PETSc, dolfinx
 from .loads import LoadPlan, check_loads, draw_load, loaded_nodes
+from .lock import locked
 from .materials import MATERIALS, Material
 from .modes import eigenmodes
 from .outcome import Equilibrium, NotConverged
@@ -158,17 +158,9 @@ def generate(
 def _locked(path: Path) -> Iterator[None]:
     """Keep others from writing the same data set; the system lets go of the lock when the process ends in any way."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(path.with_name(f".{path.name}.lock"), timeout=_PATIENCE_S)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise DataSetError(
-            f"generate.path: another `generate` is at work in {path}; wait for it, end it, or choose another folder."
-        ) from None
-    try:
+    refusal = f"generate.path: another `generate` is at work in {path}; wait for it, end it, or choose another folder."
+    with locked(path.with_name(f".{path.name}.lock"), DataSetError(refusal), _PATIENCE_S):
         yield
-    finally:
-        lock.release()
 
 
 def _solve(path: Path, blocks: list[int], comm: Any) -> None:
