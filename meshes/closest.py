@@ -14,6 +14,8 @@ from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkGenericCell, vtkPolyD
 from .body import Floats, Ints, Surface
 
 _LONGEST_WALK = 60  # triangles that a point may cross
+_TINY = 1e-300  # a triangle without area divides by it
+_ROUNDING = 1e-15  # of a squared distance, relative to the square of the surface's extent
 
 
 def polydata(surface: Surface) -> vtkPolyData:
@@ -129,14 +131,17 @@ class ClosestPoints:
         """
         tree = cKDTree(positions[self._used], balanced_tree=False, compact_nodes=False)  # asked once: built fast
         star = self._stars[self._used[tree.query(cloud)[1]]]
-        return self.follow(positions, cloud, self._best(positions, cloud, star)[0])
+        return self._walked(positions, cloud, *self._best(positions, cloud, star))
 
-    def _best(self, positions: Floats, cloud: Floats, choice: Ints) -> tuple[Ints, Floats]:
-        """Of so many triangles for each point, (p, c), the closest, and its weights, (p, 3)."""
-        corners = positions[self.triangles[choice.ravel()]]
-        tried, squares = closest_in_triangles(corners, np.repeat(cloud, choice.shape[1], axis=0))
-        best, rows = squares.reshape(choice.shape).argmin(axis=1), np.arange(len(cloud))
-        return choice[rows, best], tried.reshape(*choice.shape, 3)[rows, best]
+    def _best(self, positions: Floats, cloud: Floats, choice: Ints) -> tuple[Ints, Floats, Floats]:
+        """Of up to c triangles for each point, (p, c), the closest, its weights, (p, 3), and its squared distance."""
+        asked = choice >= 0
+        points = np.nonzero(asked)[0]
+        tried, found = closest_in_triangles(positions[self.triangles[choice[asked]]], cloud[points])
+        squares, place = np.full(choice.shape, np.inf), np.zeros(choice.shape, dtype=np.int64)
+        squares[asked], place[asked] = found, np.arange(len(found))
+        best, rows = squares.argmin(axis=1), np.arange(len(cloud))
+        return choice[rows, best], tried[place[rows, best]], squares[rows, best]
 
     def follow(self, positions: Floats, cloud: Floats, near: Ints) -> tuple[Ints, Floats]:
         """The same by walking from triangle to triangle: a local minimum of the distance, found in a tenth of the time.
@@ -146,21 +151,27 @@ class ClosestPoints:
             cloud: points, (p, 3), metres.
             near: triangles to start from, (p,).
         """
-        found = near.copy()
-        weights, _ = closest_in_triangles(positions[self.triangles[found]], cloud)
+        weights, squares = closest_in_triangles(positions[self.triangles[near]], cloud)
+        return self._walked(positions, cloud, near.copy(), weights, squares)
+
+    def _walked(
+        self, positions: Floats, cloud: Floats, found: Ints, weights: Floats, squares: Floats
+    ) -> tuple[Ints, Floats]:
+        """To where no neighbour is closer by more than rounding: between two that share an edge a point stays."""
+        rounding = _ROUNDING * float((np.ptp(positions, axis=0) ** 2).sum())
         moving = np.flatnonzero((weights <= 0.0).any(axis=1))
         for _ in range(_LONGEST_WALK):
             if not len(moving):
                 break
-            chosen, weights[moving] = self._best(positions, cloud[moving], self._rings[found[moving]])
-            changed = chosen != found[moving]
-            found[moving] = chosen
-            moving = moving[changed]
+            chosen, at, square = self._best(positions, cloud[moving], self._rings[found[moving]])
+            closer = square < squares[moving] - rounding
+            moving = moving[closer]
+            found[moving], weights[moving], squares[moving] = chosen[closer], at[closer], square[closer]
         return found, weights
 
 
 def _stars_and_rings(triangles: Ints, vertices: int) -> tuple[Ints, Ints]:
-    """The triangles at each vertex, (n, s), and at each triangle's vertices, (t, r), repeated to one length."""
+    """The triangles at each vertex, (n, s), and at each triangle's vertices, (t, r), -1 where there are fewer."""
     incidence = csr_array(
         (np.ones(triangles.size), triangles.ravel(), np.arange(0, triangles.size + 1, 3)),
         shape=(len(triangles), vertices),
@@ -169,10 +180,11 @@ def _stars_and_rings(triangles: Ints, vertices: int) -> tuple[Ints, Ints]:
 
 
 def _padded(matrix: csr_array) -> Ints:
-    """Column numbers of each row, the last repeated to one length; of no use where a row has none."""
-    begin, end = matrix.indptr[:-1], matrix.indptr[1:]
-    places = begin[:, None] + np.arange(np.diff(matrix.indptr).max(initial=1))
-    return matrix.indices[np.clip(places, 0, np.maximum(end, 1)[:, None] - 1)].astype(np.int64)
+    """Column numbers of each row, with -1 behind them to one length."""
+    counts = np.diff(matrix.indptr)
+    found = np.full((matrix.shape[0], counts.max(initial=1)), -1, dtype=np.int64)
+    found[np.arange(found.shape[1]) < counts[:, None]] = matrix.indices
+    return found
 
 
 def closest_in_triangles(corners: Floats, points: Floats) -> tuple[Floats, Floats]:
@@ -180,35 +192,40 @@ def closest_in_triangles(corners: Floats, points: Floats) -> tuple[Floats, Float
 
     The unconstrained minimum where it is inside, else the best of the three edges.
     """
-    a = corners[:, 0]
-    e, f, g = corners[:, 1] - a, corners[:, 2] - a, points - a
+    a, b, c = np.ascontiguousarray(np.moveaxis(corners, 0, 2))  # components in rows: three times as fast
+    e, f, g = b - a, c - a, points.T - a
     ee, ef, ff = _dot(e, e), _dot(e, f), _dot(f, f)
     ge, gf, gg = _dot(g, e), _dot(g, f), _dot(g, g)
-    tiny = 1e-300
-    size = np.maximum(ee * ff - ef * ef, tiny)
+    size = np.maximum(ee * ff - ef * ef, _TINY)
     v, w = (ff * ge - ef * gf) / size, (ee * gf - ef * ge) / size
-    outside = (v < 0.0) | (w < 0.0) | (v + w > 1.0)
-    on_e = np.clip(ge / np.maximum(ee, tiny), 0.0, 1.0)
-    on_f = np.clip(gf / np.maximum(ff, tiny), 0.0, 1.0)
+    outside = np.flatnonzero((v < 0.0) | (w < 0.0) | (v + w > 1.0))
+    v[outside], w[outside] = _on_edges(ee[outside], ef[outside], ff[outside], ge[outside], gf[outside])
+    return np.stack([1.0 - v - w, v, w], axis=1), np.maximum(gg + _beyond(v, w, ee, ef, ff, ge, gf), 0.0)
+
+
+def _on_edges(ee: Floats, ef: Floats, ff: Floats, ge: Floats, gf: Floats) -> tuple[Floats, Floats]:
+    """Weights v, w of the closest point on the three edges of each triangle, (p,)."""
+    zero = np.zeros_like(ee)
+    on_e = np.clip(ge / np.maximum(ee, _TINY), 0.0, 1.0)
+    on_f = np.clip(gf / np.maximum(ff, _TINY), 0.0, 1.0)
     # Along the edge from b to c: b + t (c - b).
-    opposite = np.maximum(ee - 2.0 * ef + ff, tiny)
-    on_g = np.clip((gf - ge - ef + ee) / opposite, 0.0, 1.0)
-    zero = np.zeros_like(v)
-    choices_v = np.stack([on_e, zero, 1.0 - on_g])
-    choices_w = np.stack([zero, on_f, on_g])
-    squares = _square(choices_v, choices_w, ee, ef, ff, ge, gf, gg)
-    best = squares.argmin(axis=0)
-    rows = np.arange(len(points))
-    v = np.where(outside, choices_v[best, rows], v)
-    w = np.where(outside, choices_w[best, rows], w)
-    return np.stack([1.0 - v - w, v, w], axis=1), np.maximum(_square(v, w, ee, ef, ff, ge, gf, gg), 0.0)
+    on_g = np.clip((gf - ge - ef + ee) / np.maximum(ee - 2.0 * ef + ff, _TINY), 0.0, 1.0)
+    v, w = on_e, zero
+    square = _beyond(v, w, ee, ef, ff, ge, gf)
+    for other in ((zero, on_f), (1.0 - on_g, on_g)):
+        tried = _beyond(*other, ee, ef, ff, ge, gf)
+        closer = tried < square
+        v, w = np.where(closer, other[0], v), np.where(closer, other[1], w)
+        square = np.minimum(tried, square)
+    return v, w
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
-    return np.einsum("pi,pi->p", a, b)
+    found: Floats = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return found
 
 
-def _square(v: Floats, w: Floats, ee: Floats, ef: Floats, ff: Floats, ge: Floats, gf: Floats, gg: Floats) -> Floats:
-    """|g - v e - w f|^2."""
-    found: Floats = gg + v * (v * ee - 2.0 * ge) + w * (w * ff - 2.0 * gf) + 2.0 * v * w * ef
+def _beyond(v: Floats, w: Floats, ee: Floats, ef: Floats, ff: Floats, ge: Floats, gf: Floats) -> Floats:
+    """|g - v e - w f|^2 less |g|^2."""
+    found: Floats = v * (v * ee - 2.0 * ge) + w * (w * ff - 2.0 * gf) + 2.0 * v * w * ef
     return found

@@ -20,6 +20,7 @@ from .problem import Problem, Trial
 Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
 _KEPT = 0.2  # a whole step that misses its promise by less: where only a start is wanted, it was the last
+_TRUSTED = 3.0  # deviations
 _UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
 
 
@@ -84,15 +85,18 @@ class GaussNewton:
         graduation: the noise is taken as at least this part of what the linear model promises to change.
         max_step: first limit on the movement of any observed node in one step, metres.
         least_step: no step that moves all observed nodes less than this is tried, metres.
+        trusted: before the end closest points are searched anew, of points further from the surface than so many of
+            their deviations; 0 for all.
     """
 
     losses: tuple[Loss, ...] = (Huber(), Tukey())
     max_iterations: int = 40
     settled: float = 0.2
     handed_on: float = 1.0
-    graduation: float = 0.5
+    graduation: float = 1.0
     max_step: float = 16e-3
     least_step: float = 1e-6
+    trusted: float = 0.0
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
@@ -109,6 +113,10 @@ class GaussNewton:
     def last(self) -> GaussNewton:
         """The same with the last loss alone: from where all have been."""
         return replace(self, losses=self.losses[-1:])
+
+    def following(self) -> GaussNewton:
+        """The same from the state of a frame before: feet found by walking stay feet over so short a way."""
+        return replace(self, trusted=max(self.trusted, _TRUSTED))
 
     def without_steps(self) -> GaussNewton:
         """The same, which takes any start for the end: to judge it."""
@@ -175,7 +183,8 @@ class _Search:
 
     def _is_closest(self, local: LocalModel, settled: float) -> bool:
         """Search the closest points anew; True where that moves the minimum no further than the search goes."""
-        before, again = self.trial.match.distances, self.problem.again(self.trial)
+        before = self.trial.match.distances
+        again = self.problem.again(self.trial, self.options.trusted * robust_deviation(before))
         if np.abs(again.match.distances - before).max() >= _UNCHANGED * self.noise:
             self.trial = again
         return local.length_for(again.match.distances) < settled

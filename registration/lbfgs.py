@@ -51,6 +51,10 @@ class LBFGS:
         """The same with the last loss alone: from where all have been."""
         return replace(self, losses=self.losses[-1:])
 
+    def following(self) -> LBFGS:
+        """The same: every closest point is searched anew in any case."""
+        return self
+
     def without_steps(self) -> LBFGS:
         """The same with one short run: to judge a start."""
         return replace(self, losses=self.losses[:1], max_iterations=1)

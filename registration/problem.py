@@ -134,9 +134,14 @@ class Problem:
         alike = max(len(self.cloud) / self.error.discrepancy.places, 1.0)
         return np.sqrt(alike) * np.einsum("pk,pk->p", trial.match.weights, corners)
 
-    def again(self, trial: Trial) -> Trial:
-        """The same trial with its closest points searched anew."""
-        return replace(trial, match=self.observed.match(trial.positions, trial.cloud))
+    def again(self, trial: Trial, beyond: float = 0.0) -> Trial:
+        """The same trial with closest points searched anew.
+
+        Args:
+            trial: at some coefficients.
+            beyond: only of points further than this from the surface, metres.
+        """
+        return replace(trial, match=self.observed.match_beyond(trial.positions, trial.cloud, trial.match, beyond))
 
     def jacobian(self, trial: Trial) -> Floats:
         """Derivative of the distances by the coefficients, (p, k), exact."""

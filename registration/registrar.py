@@ -29,8 +29,7 @@ from .unknowns import Forces, Informed, ModelError, PosePrior, contact, nodal_fo
 from .verdict import Expectations, Judgement, Verdict, judge
 
 Floats = NDArray[np.float64]
-# Of the logarithm of a nodal force. A model with an error of its own must not explain that by forces.
-EXACT_SPREAD, LEARNED_SPREAD = 1.0, 0.5
+_SPREAD = 0.5  # of the logarithm of a nodal force: with more, forces explain noise and the model's error
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
@@ -232,8 +231,9 @@ class Registrar:
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
             result = self._finished(points, start.prepared, self._from_rest(points, start.prepared), begin)
         else:
-            found = self.options.solver.solve(problem, near.coefficients, near)
-            problem, found, doubt = self._doubted(problem, found, start.doubt)
+            solver = self.options.solver.following()
+            found = solver.solve(problem, near.coefficients, near)
+            problem, found, doubt = self._doubted(problem, found, start.doubt, solver)
             result = self._result(problem, found, start.prepared, begin, doubt)
         if start.prepared is not self._everywhere and self._has_left(result, start):
             return self._cold(points, begin)
@@ -320,13 +320,15 @@ class Registrar:
             start = np.concatenate([found.trial.coefficients, errors])
             found = _after(found, solver.solve(problem, start, found.trial))
         if self.error is not None and not is_hopeless:
-            problem, found, doubt = self._doubted(problem, found, doubt)
+            problem, found, doubt = self._doubted(problem, found, doubt, self.options.solver)
         return self._result(problem, found, prepared, begin, doubt)
 
     def _is_hopeless(self, found: Found) -> bool:
         return found.posterior.scales.noise > _HOPELESS * self.expectations.noise
 
-    def _doubted(self, problem: Problem, found: Found, doubt: float) -> tuple[Problem, Found, float]:
+    def _doubted(
+        self, problem: Problem, found: Found, doubt: float, solver: GaussNewton | LBFGS
+    ) -> tuple[Problem, Found, float]:
         """Once more where the model's error is larger or smaller than its samples said: its scale is found, too.
 
         The scale is MacKay's (1992): the squares of the unknowns over the number that the cloud tells of them.
@@ -345,7 +347,7 @@ class Registrar:
             problem = replace(problem, error=replace(problem.error, size=factor * problem.error.size))
             start = found.trial.coefficients.copy()
             start[problem.error_part] /= factor
-            again = self.options.solver.last().solve(problem, start, found.trial)
+            again = solver.last().solve(problem, start, found.trial)
             found = _after(found, again)
         return problem, found, doubt
 
@@ -436,8 +438,7 @@ def prepare(
     """
     options = options or RegistrationOptions()
     observed = SurfaceDistance(model.body, triangles)
-    spread = LEARNED_SPREAD if model.error > 0.0 else EXACT_SPREAD
-    scale = Scale(force_scale, spread, least=1e-2 * force_scale)
+    scale = Scale(force_scale, _SPREAD, least=1e-2 * force_scale)
     every = nodal_forces(model.body, nodes, scale, smoothness)
     rule = Informed(options.noise.least, scale=10.0 * force_scale, most=directions)
     forces = Prepared.of(model, observed, every).informed(observed, rule).forces

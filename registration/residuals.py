@@ -77,6 +77,23 @@ class SurfaceDistance:
         positions = self.rest + displacement
         return self._matched(positions, cloud, *self._closest.near(positions, cloud))
 
+    def match_beyond(self, displacement: Floats, cloud: Floats, near: Match, distance: float) -> Match:
+        """A match found by walking, with the points that lie further than a distance from the surface searched anew.
+
+        Args:
+            displacement: of the nodes `nodes`, (m, 3), metres.
+            cloud: points, (p, 3), metres.
+            near: a match at this displacement.
+            distance: metres; what is closer may lie closer still at another place, but no more than that.
+        """
+        far = np.flatnonzero(np.abs(near.distances) > distance) if distance > 0.0 else np.arange(len(cloud))
+        if not len(far):
+            return near
+        positions = self.rest + displacement
+        triangles, weights = near.triangles.copy(), near.weights.copy()
+        triangles[far], weights[far] = self._closest.find(positions, cloud[far])
+        return self._matched(positions, cloud, triangles, weights)
+
     def _matched(self, positions: Floats, cloud: Floats, triangles: Ints, weights: Floats) -> Match:
         corners = positions[self.triangles[triangles]]
         offsets = np.einsum("pk,pki->pi", weights, corners) - cloud

@@ -141,7 +141,9 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
                       f"(up to {1e3 * expected.noise:.1f} mm could be noise)")
         )  # fmt: skip
     match = found.trial.match
-    systematic = noise * np.sqrt(shared(problem.observed.feet(match), match.distances, found.weights))
+    systematic = noise  # of which neighbours share a part
+    if systematic > expected.systematic:
+        systematic *= np.sqrt(shared(problem.observed.feet(match), match.distances, found.weights))
     if systematic > expected.systematic:
         verdict = Verdict.REFUSED if systematic > 2.0 * expected.systematic else Verdict.DOUBTFUL
         findings.append(

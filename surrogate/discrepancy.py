@@ -13,6 +13,7 @@ from .predictor import Surrogate
 
 Floats = NDArray[np.float64]
 _FOLDS = 4
+_MOST = 10.0  # times the median of the errors' norms
 
 
 def relative_errors(surrogate: Surrogate, data: DataSet, samples: Samples) -> Floats:
@@ -35,8 +36,10 @@ def relative_errors(surrogate: Surrogate, data: DataSet, samples: Samples) -> Fl
 def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 32) -> Surrogate:
     """The surrogate with the patterns of its errors on the validation samples: see `Discrepancy`.
 
-    What the patterns leave out is measured on samples that they were not made from. Of fewer than four samples nothing
-    is learned: the surrogate stays as it is.
+    What the patterns leave out is measured on samples that they were not made from. Errors far above the others count
+    as some times their median, as in spherical principal components (Locantore et al. 1999): patterns are of what the
+    errors look like, and how large they are is found anew in each registration. Of fewer than four samples nothing is
+    learned: the surrogate stays as it is.
 
     Args:
         surrogate: the surrogate.
@@ -46,7 +49,7 @@ def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 32) -> Sur
     samples = data.samples("validation")
     if len(samples) < _FOLDS:
         return surrogate
-    missing = relative_errors(surrogate, data, samples)
+    missing, bounded = _bounded(relative_errors(surrogate, data, samples))
     left_out = np.zeros_like(missing)
     for fold in range(_FOLDS):
         held = np.arange(len(missing)) * _FOLDS // len(missing) == fold  # whole paths: their samples are alike
@@ -56,8 +59,15 @@ def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 32) -> Sur
     rest = np.sqrt((left_out**2).mean(axis=0).reshape(-1, 3).mean(axis=1))
     frame = replace(surrogate.frame, error_modes=modes * sizes, error_rest=rest)
     seen = left_out.reshape(len(missing), -1, 3)[:, data.body.boundary_nodes]
-    card = {**surrogate.card, "discrepancy": {"samples": len(missing), "places": _places(seen)}}
+    card = {**surrogate.card, "discrepancy": {"samples": len(missing), "bounded": bounded, "places": _places(seen)}}
     return Surrogate(surrogate.body, frame, surrogate.core, card)
+
+
+def _bounded(missing: Floats) -> tuple[Floats, int]:
+    """The errors with no norm above so many times their median, and how many were."""
+    sizes = np.linalg.norm(missing, axis=1)
+    parts = np.minimum(1.0, _MOST * np.median(sizes) / np.maximum(sizes, 1e-300))
+    return parts[:, None] * missing, int((parts < 1.0).sum())
 
 
 def _places(fields: Floats) -> float:

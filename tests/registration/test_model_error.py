@@ -76,7 +76,7 @@ def test_doubt_of_the_net_force_knows_of_the_models_error(body: Body) -> None:
     scores, blind = [], []
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        cloud = cloud_on(body, true_displacement(body, rng.standard_normal(2)), 200, rng, 5e-4)
+        cloud = cloud_on(body, true_displacement(body, rng.standard_normal(2)), 400, rng, 5e-4)
         result = made.register(cloud)
         missed = (result.net_force - NET)[1:]
         scores.append(missed @ np.linalg.solve(result.net_force_covariance[1:, 1:], missed) / 2.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -79,6 +81,29 @@ def test_following_finds_what_searching_finds(body: Body, rng) -> None:
     ]
     assert (lengths[1] >= lengths[0] - 1e-12).all()
     assert np.isclose(*lengths, atol=1e-12).mean() > 0.9
+
+
+def test_a_point_between_two_triangles_stays(body: Body, rng, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Feet on edges and vertices are as near on each triangle but for rounding: no going to and fro."""
+    closest = ClosestPoints(body.surfaces["observed"], len(body.points))
+    cloud = cloud_on(body, np.zeros_like(body.points), 500, rng, noise=3e-2)
+    found, _ = closest.find(body.points, cloud)
+    asked, best = [], ClosestPoints._best
+    monkeypatch.setattr(ClosestPoints, "_best", lambda *of: (asked.append(len(of[2])), best(*of))[1])
+    closest.follow(body.points, cloud, found)
+    assert asked[0] > 20 and len(asked) <= 2
+
+
+def test_only_far_points_are_searched_anew(body: Body, observed: SurfaceDistance, rng) -> None:
+    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement
+    cloud, moved = cloud_on(body, truth, 300, rng, 5e-3), truth[observed.nodes]
+    astray = observed.match(moved, cloud, replace(observed.match(moved, cloud), triangles=np.zeros(300, dtype=int)))
+    exact, limit = observed.match(moved, cloud).distances, float(np.quantile(np.abs(astray.distances), 0.7))
+    some = observed.match_beyond(moved, cloud, astray, limit).distances
+    far = np.abs(astray.distances) > limit
+    assert (np.abs(astray.distances[far]) > np.abs(exact[far]) + 1e-9).any()
+    np.testing.assert_array_equal(some, np.where(far, exact, astray.distances))
+    np.testing.assert_array_equal(observed.match_beyond(moved, cloud, astray, 0.0).distances, exact)
 
 
 def test_the_nearest_vertex_leads_to_the_closest_point(body: Body, observed: SurfaceDistance, rng) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from softtwin.reference.dataset import DataSet
+from softtwin.surrogate import discrepancy
 from softtwin.surrogate.discrepancy import relative_errors, with_discrepancy
 from softtwin.surrogate.predictor import Surrogate, load, save
 
@@ -32,6 +33,20 @@ def test_their_size_is_that_of_the_errors(reduced: Surrogate, data: DataSet) -> 
     few = with_discrepancy(reduced, data, most=2).discrepancy
     np.testing.assert_allclose((every.modes**2).sum(), (missing**2).sum() / len(missing))
     assert few.modes.shape[1] == 2 and few.rest.sum() > every.rest.sum()
+
+
+def test_one_error_far_above_the_others_does_not_speak_for_all(
+    reduced: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sample on another branch, say: it counts, as some times the median of the others."""
+    before = with_discrepancy(reduced, data)
+    missing = relative_errors(reduced, data, data.samples("validation"))
+    missing[3] *= 1e3 * np.median(np.linalg.norm(missing, axis=1)) / np.linalg.norm(missing[3])
+    monkeypatch.setattr(discrepancy, "relative_errors", lambda *_: missing)
+    after = with_discrepancy(reduced, data)
+    assert after.card["discrepancy"]["bounded"] == before.card["discrepancy"]["bounded"] + 1
+    assert (after.discrepancy.modes**2).sum() < 10.0 * (before.discrepancy.modes**2).sum()
+    assert (after.discrepancy.rest**2).sum() < 10.0 * (before.discrepancy.rest**2).sum()
 
 
 def test_a_saved_twin_keeps_them(reduced: Surrogate, data: DataSet, tmp_path: Path) -> None:
