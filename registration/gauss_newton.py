@@ -114,6 +114,10 @@ class GaussNewton:
         """The same with the last loss alone: from where all have been."""
         return replace(self, losses=self.losses[-1:])
 
+    def unsettled(self) -> GaussNewton:
+        """The same, ended early: where another goes on from there."""
+        return replace(self, settled=self.handed_on)
+
     def following(self) -> GaussNewton:
         """The same from the state of a frame before: feet found by walking stay feet over so short a way."""
         return replace(self, trusted=max(self.trusted, _TRUSTED))

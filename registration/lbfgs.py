@@ -51,6 +51,10 @@ class LBFGS:
         """The same with the last loss alone: from where all have been."""
         return replace(self, losses=self.losses[-1:])
 
+    def unsettled(self) -> LBFGS:
+        """The same: where it ends is not known before."""
+        return self
+
     def following(self) -> LBFGS:
         """The same: every closest point is searched anew in any case."""
         return self

@@ -29,7 +29,9 @@ from .unknowns import Forces, Informed, ModelError, PosePrior, contact, nodal_fo
 from .verdict import Expectations, Judgement, Verdict, judge
 
 Floats = NDArray[np.float64]
-_SPREAD = 0.5  # of the logarithm of a nodal force: with more, forces explain noise and the model's error
+# Of the logarithm of a nodal force: with more, forces explain noise and the model's error. Without either, a pull at a
+# few nodes makes it many times what was expected.
+_SPREAD, _CLEAR_SPREAD = 0.5, 1.0
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
@@ -51,6 +53,7 @@ class Gathering:
         rounds: how often.
         anew: each round begins at rest and not where the one before ended: safer, and as many solves again.
         above: clouds of less noise tell the place of the forces themselves, metres.
+        clear: clouds of less noise tell the size of the forces, whatever was expected of it, metres.
         reach: forces within this part of the body's size are gathered together.
         informed: which directions are kept of gathered forces.
         points: so many of the cloud are enough, but for the last round.
@@ -59,6 +62,7 @@ class Gathering:
     rounds: int = 2
     anew: bool = True
     above: float = 0.0
+    clear: float = 0.0
     reach: float = 0.035
     informed: Informed = field(default_factory=Informed)
     points: int = 300
@@ -114,6 +118,11 @@ class Prepared:
     def leading(self, count: int) -> Prepared:
         """The first directions alone."""
         return Prepared(self.forces.leading(count), self.model.combined(np.eye(self.forces.size)[:, :count]))
+
+    def believing(self, spread: float) -> Prepared:
+        """The same with another spread of the logarithm of the forces' size."""
+        scale = replace(self.forces.scale, spread=spread)
+        return replace(self, forces=replace(self.forces, scale=scale))
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +238,8 @@ class Registrar:
         problem = self._problem(points, start.prepared, start.trial, start.doubt)
         near = problem.begun(start.trial.coefficients.copy(), start.trial)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
-            result = self._finished(points, start.prepared, self._from_rest(points, start.prepared), begin)
+            found = self._from_rest(points, start.prepared, self.options.solver)
+            result = self._finished(points, start.prepared, found, begin)
         else:
             solver = self.options.solver.following()
             found = solver.solve(problem, near.coefficients, near)
@@ -276,9 +286,10 @@ class Registrar:
 
     def _cold(self, points: Floats, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more for each round of gathering them."""
-        prepared, gathering = self._everywhere, self.options.gathering
-        few = _thinned(points, gathering.points)
-        found = self._from_rest(few if gathering.rounds else points, prepared)
+        prepared, gathering, solver = self._everywhere, self.options.gathering, self.options.solver
+        few, goes_on = _thinned(points, gathering.points), not gathering.anew
+        first = solver.unsettled() if goes_on else solver
+        found = self._from_rest(few if gathering.rounds else points, prepared, first)
         for left in reversed(range(gathering.rounds)):
             if self._is_hopeless(found) or found.posterior.scales.noise < gathering.above:
                 break
@@ -286,27 +297,32 @@ class Registrar:
             nodal = prepared.forces.forces(found.trial.coefficients[:size])
             prepared = self._gathered(nodal)
             found = _after(found, self._again(some, prepared, nodal, found.trial.coefficients[size:], found))
+        is_clear = found.posterior.scales.noise < gathering.clear
+        if is_clear:
+            prepared = prepared.believing(_CLEAR_SPREAD)
+        if (is_clear or goes_on) and not self._is_hopeless(found):
+            problem = self._plain(points, prepared)
+            found = _after(found, solver.last().solve(problem, found.trial.coefficients, found.trial))
         return self._finished(points, prepared, found, begin)
 
     def _again(self, points: Floats, prepared: Prepared, nodal: Floats, others: Floats, found: Found) -> Found:
         """With gathered forces: from rest, or where that is dear from the nodal forces and other unknowns found."""
         if self.options.gathering.anew:
-            return self._from_rest(points, prepared)
+            return self._from_rest(points, prepared, self.options.solver)
         start = np.concatenate([prepared.forces.nearest(nodal), others])
         try:
             return self.options.solver.solve(self._plain(points, prepared), start, found.trial)
         except NotConverged:
-            return self._from_rest(points, prepared)
+            return self._from_rest(points, prepared, self.options.solver)
 
-    def _from_rest(self, points: Floats, prepared: Prepared) -> Found:
+    def _from_rest(self, points: Floats, prepared: Prepared, solver: GaussNewton | LBFGS) -> Found:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
         few, first = _thinned(points, self.options.gathering.points), prepared.leading(_LEADING)
         rough, problem = self._plain(few, first), self._plain(points, prepared)
-        begun = self.options.solver.rough().solve(rough, np.zeros(rough.size))
+        begun = solver.rough().solve(rough, np.zeros(rough.size))
         start = np.zeros(problem.size)
         start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
         start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
-        solver = self.options.solver
         if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
             solver = solver.without_steps()
         return _after(begun, solver.solve(problem, start, begun.trial))
@@ -454,8 +470,9 @@ def gathering_for(model: ForwardModel, has_zone: bool) -> Gathering:
     """
     if model.error > 0.0:
         return Gathering()
-    every = Gathering(points=_MANY)
-    return replace(every, rounds=1, anew=False, above=_CLEAR * NOISE.least) if has_zone else every
+    clear = _CLEAR * NOISE.least
+    every = Gathering(points=_MANY, clear=clear)
+    return replace(every, rounds=1, anew=False, above=clear) if has_zone else every
 
 
 def expected_force(body: Body, young_modulus: float) -> float:

@@ -106,4 +106,5 @@ def test_a_clear_cloud_needs_no_gathering(rng) -> None:
     )
     truth = model.solve(forces).displacement
     everywhere = [made.register(cloud_on(body, truth, 500, rng, noise)).prepared.forces for noise in (0.0, 2e-3)]
-    assert everywhere[0] is made.forces and everywhere[1] is not made.forces
+    assert everywhere[0].patterns is made.forces.patterns and everywhere[1].patterns is not made.forces.patterns
+    assert everywhere[0].scale.spread > everywhere[1].scale.spread == made.forces.scale.spread
