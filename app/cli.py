@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -233,7 +234,7 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 def build(
     surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, again: bool, **given: Any
 ) -> None:
-    r"""Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH): mesh, equilibria, surrogate, held-out errors.
+    """Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH): mesh, equilibria, surrogate, held-out errors.
 
     A surface may have holes, crumbs, overlaps, any winding: it is made solid, and what was done to it is said.
 
@@ -243,15 +244,16 @@ def build(
 
     \b
     WHERE is a file, or words. Lengths without a unit are in --unit.
-      veins.ply                       near its points; (n,) node numbers in .npy or .txt; for
-                                      --observed a surface, or (t, 3) node numbers in .npy
-      near:hepatic_vein:5mm           within 5 mm of the --inner surface of that name
-      ball:10,-20,35mm:15mm           centre and radius
-      box:0,0,0:40,30,20mm            two corners
-      halfspace:0,0,12mm:0,0,-1       a point, and the side that the normal points to
-      seen-from:0,-400,100mm          what a camera at that place sees
+      veins.ply                  near its points; node numbers (n,) in .npy or .txt;
+                                 for --observed a surface, or (t, 3) in .npy
+      near:hepatic_vein:5mm      near the --inner surface of that name
+      ball:10,-20,35mm:15mm      centre and radius
+      box:0,0,0:40,30,20mm       two corners
+      halfspace:0,0,12mm:0,0,-1  a point, and the side that the normal points to
+      seen-from:0,-400,100mm     what a camera at that place sees
+
     A FILE in another unit or frame has it behind its name: veins.ply:mm, tumour.stl:cm:ras.
-    """
+    """  # noqa: D301  (click's mark for lines that are kept)
     from .chain import build_twin
 
     body = {
@@ -329,7 +331,7 @@ def main(arguments: list[str] | None = None) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         with warnings.catch_warnings(), threadpool_limits(int(os.environ["OPENBLAS_NUM_THREADS"]), "blas"):
-            warnings.showwarning = _show_warning
+            warnings.showwarning = _shown_once()
             softtwin.main(args=arguments, standalone_mode=False)
     except click.ClickException as error:
         if _speaks():
@@ -395,9 +397,17 @@ def _where_from(module: str) -> str:
     return "Install what is missing: pip install 'softtwin[torch,mesh,app]'; `softtwin doctor` lists everything."
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    if not issubclass(category, _FOR_DEVELOPERS):
-        click.echo(f"warning: {' '.join(str(message).split())}", err=True)
+def _shown_once() -> Callable[..., None]:
+    """Warnings as lines, each text once: several stages read one file."""
+    said = set[str]()
+
+    def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        text = " ".join(str(message).split())
+        if not issubclass(category, _FOR_DEVELOPERS) and text not in said:
+            said.add(text)
+            click.echo(f"warning: {text}", err=True)
+
+    return show
 
 
 if __name__ == "__main__":

@@ -212,10 +212,10 @@ def _on_edges(ee: Floats, ef: Floats, ff: Floats, ge: Floats, gf: Floats) -> tup
     on_g = np.clip((gf - ge - ef + ee) / np.maximum(ee - 2.0 * ef + ff, _TINY), 0.0, 1.0)
     v, w = on_e, zero
     square = _beyond(v, w, ee, ef, ff, ge, gf)
-    for other in ((zero, on_f), (1.0 - on_g, on_g)):
-        tried = _beyond(*other, ee, ef, ff, ge, gf)
+    for other_v, other_w in ((zero, on_f), (1.0 - on_g, on_g)):
+        tried = _beyond(other_v, other_w, ee, ef, ff, ge, gf)
         closer = tried < square
-        v, w = np.where(closer, other[0], v), np.where(closer, other[1], w)
+        v, w = np.where(closer, other_v, v), np.where(closer, other_w, w)
         square = np.minimum(tried, square)
     return v, w
 

@@ -156,12 +156,19 @@ def test_a_defect_of_the_program_is_not_hidden(monkeypatch) -> None:
         main(["doctor"])
 
 
+def test_words_for_places_stand_in_lines_of_their_own(capsys) -> None:
+    lines = run(capsys, "build", "--help").splitlines()
+    assert any(line.split()[:4] == ["ball:10,-20,35mm:15mm", "centre", "and", "radius"] for line in lines)
+    assert not any("\\b" in line or "\b" in line for line in lines)
+
+
 @pytest.mark.filterwarnings("default")
 def test_warnings_are_shown_in_one_line_but_for_those_to_developers(capsys, monkeypatch) -> None:
     from softtwin.app import doctor
 
     def warned() -> list:
         warnings.warn("the mesh is\nrather coarse", UserWarning, stacklevel=1)
+        warnings.warn("the mesh is rather coarse", UserWarning, stacklevel=1)
         warnings.warn("invalid value", RuntimeWarning, stacklevel=1)
         warnings.warn("use another name", DeprecationWarning, stacklevel=1)
         warnings.warn("use another name", FutureWarning, stacklevel=1)
@@ -170,7 +177,7 @@ def test_warnings_are_shown_in_one_line_but_for_those_to_developers(capsys, monk
     before = warnings.showwarning
     monkeypatch.setattr(doctor, "checks", warned)
     said = run(capsys, "doctor").splitlines()
-    assert "warning: the mesh is rather coarse" in said and "warning: invalid value" in said
+    assert said.count("warning: the mesh is rather coarse") == 1 and "warning: invalid value" in said
     assert not any("another name" in line for line in said)
     assert warnings.showwarning is before
 
