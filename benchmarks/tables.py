@@ -1,0 +1,102 @@
+"""The tables of docs/results.md about registration, printed as Markdown from the records.
+
+python benchmarks/tables.py
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from liver import SEQUENCES
+from record import RESULTS
+from robustness import ROWS
+
+ASKED = {
+    "clean": "",
+    "noise 1 mm": "0.3; 6; 0.8-1.3",
+    "noise 2 mm": "0.4; 9; 0.8-1.3",
+    "noise 5 mm": "0.7; 15; 0.8-1.3",
+    "outliers": "0.1 / 0.3; -; <= 1.5",
+    "pose off by 2 degrees and 3 mm": "0.5; -; <= 1.5",
+    "no zone, clean": "0.6",
+    "no zone, noise 1 mm": "0.8; 8; 0.8-1.5",
+    "no zone, noise 2 mm": "0.9; 14; 0.8-1.5",
+    "no zone, noise 5 mm": "1.2; 25; 0.8-1.5",
+}
+
+
+def figures(name: str) -> dict[str, Any]:
+    path = RESULTS / f"{name}.json"
+    found: dict[str, Any] = json.loads(path.read_text())["figures"] if path.exists() else {}
+    return found
+
+
+def row(*cells: object) -> None:
+    print("| " + " | ".join(map(str, cells)) + " |")
+
+
+def head(*cells: str) -> None:
+    print()
+    row(*cells)
+    row(*["---"] * len(cells))
+
+
+def robustness(model: str) -> None:
+    """Degraded clouds: errors, calibration, time and verdicts by row and start."""
+    found = figures(f"robustness_{model}")
+    head(
+        model, "start", "TRE mm (95 %)", "force %", "z rms", "accepted %", "median s (longest)", "asked: TRE; force; z"
+    )
+    for name in ROWS:
+        for start in ("cold", "warm"):
+            f = found.get(name, {}).get(start)
+            if f is None:
+                continue
+            count = found[name]["draws"]
+            row(
+                f"{name} ({count} draw{'s' * (count > 1)})",
+                start,
+                f"{f['tre_mm']:.2f} ({f['tre_p95_mm']:.2f})",
+                f"{100 * f['force_error']:.1f}",
+                f"{f['z_rms']:.2f}",
+                f"{100 * f['accepted']:.0f}",
+                f"{f['median_seconds']:.2f} ({f['longest_seconds']:.1f})",
+                ASKED.get(name, "1.5 x clean"),
+            )
+    starts = [found[name][s] for name in found if name in ROWS for s in ("cold", "warm") if s in found[name]]
+    print(f"\nfailed: {sum(f['failed'] for f in starts)}; accepted and worse than doing nothing: "
+          f"{sum(f['accepted_worse_than_nothing'] for f in starts)}")  # fmt: skip
+    verdicts = [f"{n['cloud']}: {n['verdict']}" for n in found.get("nonsense", [])]
+    print("nonsense: " + ("; ".join(verdicts) or "not run"))
+
+
+def sequences(name: str) -> None:
+    """Whole sequences: frames 1-49, and the cold frame 0."""
+    found = figures(name)["sequences"]
+    each = [found[s]["summary"] for s in SEQUENCES]
+    head(name, *SEQUENCES)
+    for label, key, scale, form in (
+        ("mean TRE, mm", "mean_tre_mm", 1.0, ".3f"),
+        ("worst frame's mean TRE, mm", "worst_tre_mm", 1.0, ".2f"),
+        ("net force error, %", "mean_force_error", 100.0, ".1f"),
+        ("median time a frame, s", "median_seconds", 1.0, ".3f"),
+        ("95 % of them, s", "p95_seconds", 1.0, ".3f"),
+        ("longest, s", "longest_seconds", 1.0, ".2f"),
+        ("cold frame 0: TRE, mm", "cold_tre_mm", 1.0, ".3f"),
+        ("- force, %", "cold_force_error", 100.0, ".1f"),
+        ("- time, s", "cold_seconds", 1.0, ".2f"),
+    ):
+        row(label, *(format(scale * f[key], form) for f in each))
+    print(f"\nmean TRE of all: {sum(f['mean_tre_mm'] for f in each) / len(each):.3f} mm")
+
+
+def main() -> None:
+    for model in ("surrogate", "reference"):
+        robustness(model)
+    sequences("registration_reference_default_facets")
+    sequences("registration_surrogate")
+
+
+if __name__ == "__main__":
+    main()
