@@ -30,6 +30,7 @@ _EDGE_RATIO = 1.4  # fTetWild's wanted edge over the mean edge that it makes
 # Nodes are about this times volume / size^3 and this times area / size^2 (measured on organ surfaces).
 _NODES_IN_CUBE, _NODES_ON_SQUARE = 0.72, 1.44
 _LEFT_OUT = 0.01  # of the surface's size: a component whose median point lies farther from the solid is not in it
+_LARGE_PART = 0.05  # of the volume
 _SEARCHES = 5
 _COUNT_TOLERANCE = 0.15
 _SLOPE = 2.2  # nodes fall with this power of the cell size: 3 inside, 2 on the surface, less where details bind
@@ -74,7 +75,14 @@ class Mending:
             + (f", with what was left out {share:.4f} of it" if self.dropped else f" ({share:.4f} of it)"),
             f"moved at most {1e3 * self.distance:.2f} mm, {1e3 * self.mean_distance:.3f} mm on average",
         ]
-        return "\n".join(f"surface: {line}" for line in lines)
+        lines = [f"surface: {line}" for line in lines]
+        lost = sum(map(abs, self.dropped)) / self.volume_before
+        if lost > _LARGE_PART:
+            lines.append(
+                f"warning: {100 * lost:.0f} % of the surface's volume is in components that were left out; where the "
+                "file holds several organs, give one a file"
+            )
+        return "\n".join(lines)
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,6 +97,13 @@ def test_a_surface_that_cuts_itself_becomes_solid(ball: Surface) -> None:
     assert 0.7 * ball.volume < Body(solid.points, solid.cells, {}).volume < 1.1 * ball.volume
 
 
+def test_a_large_component_is_not_left_out_without_a_warning(ball: Surface) -> None:
+    beside = Surface(0.6 * ball.points + np.array([0.0, 0.1, 0.0]), ball.triangles)
+    said = str(solidify(joined(ball, beside), cell_size=SIZE).mending)
+    assert re.search(r"^warning: 18 % of the surface's volume is in components that were left out", said, re.MULTILINE)
+    assert "warning" not in str(solidify(crumbs(ball), cell_size=SIZE).mending)
+
+
 def test_two_balls_that_overlap_become_one(ball: Surface) -> None:
     shift = np.array([0.06, 0.0, 0.0])
     solid = solidify(joined(ball, Surface(ball.points + shift, ball.triangles)), cell_size=SIZE)
