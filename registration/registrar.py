@@ -41,6 +41,7 @@ _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
 _MANY = 10_000  # points: of no cloud that is left after thinning are there more
 _CLEAR = 2.0  # times the least noise
+_CLOSE = 0.02  # reach of forces whose zone is unknown: with more, their doubt is larger than their error
 _LEADING = 6  # directions of force that a cold start begins with
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
 
@@ -469,7 +470,7 @@ def gathering_for(model: ForwardModel, has_zone: bool) -> Gathering:
         has_zone: the nodes that may carry force are those that a tool can touch.
     """
     if model.error > 0.0:
-        return Gathering()
+        return Gathering() if has_zone else Gathering(reach=_CLOSE)
     clear = _CLEAR * NOISE.least
     every = Gathering(points=_MANY, clear=clear)
     return replace(every, rounds=1, anew=False, above=clear) if has_zone else every
