@@ -299,11 +299,12 @@ class Registrar:
             prepared = self._gathered(nodal)
             found = _after(found, self._again(some, prepared, nodal, found.trial.coefficients[size:], found))
         is_clear = found.posterior.scales.noise < gathering.clear
-        if is_clear:
-            prepared = prepared.believing(_CLEAR_SPREAD)
+        again = solver.last()
+        if is_clear:  # what forces of the size expected could not meet has been taken for outliers: all losses again
+            prepared, again = prepared.believing(_CLEAR_SPREAD), solver
         if (is_clear or goes_on) and not self._is_hopeless(found):
             problem = self._plain(points, prepared)
-            found = _after(found, solver.last().solve(problem, found.trial.coefficients, found.trial))
+            found = _after(found, again.solve(problem, found.trial.coefficients, found.trial))
         return self._finished(points, prepared, found, begin)
 
     def _again(self, points: Floats, prepared: Prepared, nodal: Floats, others: Floats, found: Found) -> Found:
@@ -472,8 +473,9 @@ def gathering_for(model: ForwardModel, has_zone: bool) -> Gathering:
     if model.error > 0.0:
         return Gathering() if has_zone else Gathering(reach=_CLOSE)
     clear = _CLEAR * NOISE.least
-    every = Gathering(points=_MANY, clear=clear)
-    return replace(every, rounds=1, anew=False, above=clear) if has_zone else every
+    if has_zone:
+        return Gathering(rounds=1, anew=False, above=clear, clear=clear, points=_MANY)
+    return Gathering(clear=clear, reach=_CLOSE, points=_MANY)
 
 
 def expected_force(body: Body, young_modulus: float) -> float:
