@@ -338,7 +338,7 @@ class Registrar:
             start = np.concatenate([found.trial.coefficients, errors])
             found = _after(found, solver.solve(problem, start, found.trial))
         if self.error is not None and not is_hopeless:
-            problem, found, doubt = self._doubted(problem, found, doubt, self.options.solver)
+            problem, found, doubt = self._doubted(problem, found, doubt, self.options.solver.following())
         return self._result(problem, found, prepared, begin, doubt)
 
     def _is_hopeless(self, found: Found) -> bool:

@@ -203,6 +203,7 @@ class Surrogate:
         self.core = core
         self.card: Mapping[str, Any] = MappingProxyType(dict(card))
         self.rows = (3 * frame.loaded[:, None] + np.arange(3)).ravel()
+        self._single_rows: dict[str, NDArray[Any]] = {}  # of the linear part, those asked for last
         self._idle = np.setdiff1d(np.arange(len(body.points)), np.union1d(frame.loaded, body.fixed))
 
     @property
@@ -249,6 +250,22 @@ class Surrogate:
         if len(chosen) and (chosen.min() < 0 or chosen.max() >= len(self.body.points)):
             raise ValueError(f"nodes: expected 0..{len(self.body.points) - 1}, got {chosen.min()}..{chosen.max()}.")
         return ReducedSurrogate(self, chosen, self.at_loaded("basis", basis))
+
+    def linear_rows(self, rows: Ints, columns: Floats) -> Floats:
+        """Some rows of the linear part of the displacement, (q, k), in single precision: good to 1e-6.
+
+        Args:
+            rows: numbers of the wanted components, (q,).
+            columns: forces at the loaded nodes, (3l, k), newtons.
+        """
+        known = self._single_rows.get("rows")
+        if known is None or not np.array_equal(known, rows):
+            self._single_rows = {"rows": rows, "left": self.frame.left[rows].astype(np.float32)}
+            if self.frame.right is not None:
+                self._single_rows["right"] = self.frame.right.astype(np.float32)
+        forces, right = columns.astype(np.float32), self._single_rows.get("right")
+        found: Floats = (self._single_rows["left"] @ (forces if right is None else right @ forces)).astype(np.float64)
+        return found
 
     def with_card(self, **entries: Any) -> Surrogate:
         """The same surrogate with more entries in its card, for instance held-out errors."""
@@ -337,10 +354,9 @@ class ReducedSurrogate:
     def __init__(self, surrogate: Surrogate, nodes: Ints, basis: Floats) -> None:
         frame = surrogate.frame
         picked = (3 * nodes[:, None] + np.arange(3)).ravel()
-        self.surrogate = surrogate
+        self.surrogate, self._basis, self._combination = surrogate, basis, np.eye(basis.shape[1])
         self.encode = frame.encode @ basis
-        self._linear, self._combination = frame.linear(basis), np.eye(basis.shape[1])
-        self._linear_rows, self._decode_rows = self._linear[picked], frame.decode[picked]
+        self._linear_rows, self._decode_rows = surrogate.linear_rows(picked, basis), frame.decode[picked]
         self.rows = np.hstack([self._linear_rows, self._decode_rows])  # by the coefficients and by what the core says
         self.offset_rows = frame.offset[picked]
 
@@ -352,14 +368,19 @@ class ReducedSurrogate:
     def combined(self, matrix: Floats) -> ReducedSurrogate:
         """The same for the basis times a matrix, (k, j), for the price of some small products."""
         other = copy(self)
+        other.__dict__.pop("_linear", None)
         other.encode, other._combination = self.encode @ matrix, self._combination @ matrix
         other._linear_rows = self._linear_rows @ matrix
         other.rows = np.hstack([other._linear_rows, self._decode_rows])
         return other
 
+    @cached_property
+    def _linear(self) -> Floats:
+        return self.surrogate.frame.linear(self._basis @ self._combination)
+
     def linear(self, coefficients: Floats) -> Floats:
         """Linear part of the displacement of all nodes, (3n,), metres."""
-        return self._linear @ (self._combination @ coefficients)
+        return self._linear @ coefficients
 
     def solve(self, coefficients: ArrayLike, near: Any = None) -> ReducedSurrogateState:
         """The state for force coefficients, (k,): `near` itself where it is that.
