@@ -275,7 +275,8 @@ class Twin:
         body, section = self.body, self.config.registration
         if camera is not None:
             plain = self.registrar(zone)
-            return Registrar(self.model, plain.observed, plain.forces, plain.options, pose=camera)
+            options = _options(section, gathering_for(self.model, bool(zone), has_pose=True))
+            return Registrar(self.model, plain.observed, plain.forces, options, pose=camera)
         if zone and zone not in body.node_sets:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
         return prepare(

@@ -116,7 +116,7 @@ def registrar_for(
         zone,
         model.body.surfaces["observed"],
         force_scale=expected_force(model.body, YOUNG_MODULUS),
-        options=RegistrationOptions(gathering=gathering_for(model, zoned)),
+        options=RegistrationOptions(gathering=gathering_for(model, zoned, pose is not None)),
         pose=pose,
     )
 

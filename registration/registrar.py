@@ -41,7 +41,7 @@ _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
 _MANY = 10_000  # points: of no cloud that is left after thinning are there more
 _CLEAR = 2.0  # times the least noise
-_CLOSE = 0.02  # reach of forces whose zone is unknown: with more, their doubt is larger than their error
+_CLOSE = 0.01  # reach of forces whose zone is unknown: with more, their doubt is larger than their error
 _LEADING = 6  # directions of force that a cold start begins with
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
 
@@ -288,8 +288,8 @@ class Registrar:
     def _cold(self, points: Floats, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more for each round of gathering them."""
         prepared, gathering, solver = self._everywhere, self.options.gathering, self.options.solver
-        few, goes_on = _thinned(points, gathering.points), not gathering.anew
-        first = solver.unsettled() if goes_on else solver
+        few, is_settled = _thinned(points, gathering.points), gathering.anew or not gathering.rounds
+        first = solver if is_settled else solver.unsettled()
         found = self._from_rest(few if gathering.rounds else points, prepared, first)
         for left in reversed(range(gathering.rounds)):
             if self._is_hopeless(found) or found.posterior.scales.noise < gathering.above:
@@ -298,14 +298,8 @@ class Registrar:
             nodal = prepared.forces.forces(found.trial.coefficients[:size])
             prepared = self._gathered(nodal)
             found = _after(found, self._again(some, prepared, nodal, found.trial.coefficients[size:], found))
-        is_clear = found.posterior.scales.noise < gathering.clear
-        again = solver.last()
-        if is_clear:  # what forces of the size expected could not meet has been taken for outliers: all losses again
-            prepared, again = prepared.believing(_CLEAR_SPREAD), solver
-        if (is_clear or goes_on) and not self._is_hopeless(found):
-            problem = self._plain(points, prepared)
-            found = _after(found, again.solve(problem, found.trial.coefficients, found.trial))
-        return self._finished(points, prepared, found, begin)
+            is_settled = True
+        return self._finished(points, prepared, found, begin, is_settled)
 
     def _again(self, points: Floats, prepared: Prepared, nodal: Floats, others: Floats, found: Found) -> Found:
         """With gathered forces: from rest, or where that is dear from the nodal forces and other unknowns found."""
@@ -329,17 +323,34 @@ class Registrar:
             solver = solver.without_steps()
         return _after(begun, solver.solve(problem, start, begun.trial))
 
-    def _finished(self, points: Floats, prepared: Prepared, found: Found, begin: float) -> Registration:
+    def _finished(
+        self, points: Floats, prepared: Prepared, found: Found, begin: float, is_settled: bool = True
+    ) -> Registration:
         """With all points, and with the model's error in patterns, from a result that took it for noise."""
-        problem, doubt, is_hopeless = self._problem(points, prepared, found.trial), 1.0, self._is_hopeless(found)
-        if self.error is not None or len(found.trial.cloud) < len(points):
-            solver = self.options.solver.without_steps() if is_hopeless else self.options.solver
+        solver, doubt, is_hopeless = self.options.solver, 1.0, self._is_hopeless(found)
+        if is_hopeless:
+            solver = solver.without_steps()
+        believed = self._believed(prepared, found)
+        problem = self._problem(points, believed, found.trial)
+        is_settled = is_settled and believed is prepared and len(found.trial.cloud) == len(points)
+        if self.error is not None or not is_settled:
             errors = np.zeros(problem.size - len(found.trial.coefficients))
             start = np.concatenate([found.trial.coefficients, errors])
             found = _after(found, solver.solve(problem, start, found.trial))
+        wider = self._believed(believed, found)
+        if wider is not believed:  # clear only now that the model's error is told from noise
+            believed, problem = wider, replace(problem, forces=wider.forces)
+            found = _after(found, solver.solve(problem, found.trial.coefficients, found.trial))
         if self.error is not None and not is_hopeless:
             problem, found, doubt = self._doubted(problem, found, doubt, self.options.solver.following())
-        return self._result(problem, found, prepared, begin, doubt)
+        return self._result(problem, found, believed, begin, doubt)
+
+    def _believed(self, prepared: Prepared, found: Found) -> Prepared:
+        """The forces' size as the cloud tells it, where it is clear: what was expected would call a pull outliers."""
+        is_clear = found.posterior.scales.noise < self.options.gathering.clear
+        if not is_clear or prepared.forces.scale.spread >= _CLEAR_SPREAD:
+            return prepared
+        return prepared.believing(_CLEAR_SPREAD)
 
     def _is_hopeless(self, found: Found) -> bool:
         return found.posterior.scales.noise > _HOPELESS * self.expectations.noise
@@ -463,16 +474,20 @@ def prepare(
     return Registrar(model, observed, forces, options, pose=pose)
 
 
-def gathering_for(model: ForwardModel, has_zone: bool) -> Gathering:
+def gathering_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> Gathering:
     """How forces are gathered: an exact model's solves are dear, and a clear cloud tells it where a zone is pulled.
+
+    What a surrogate gets wrong could be taken for large forces; where the pose is unknown, forces that are expected
+    small would be taken for a turn of the organ, which is worse.
 
     Args:
         model: forward model.
         has_zone: the nodes that may carry force are those that a tool can touch.
+        has_pose: the pose is unknown.
     """
-    if model.error > 0.0:
-        return Gathering() if has_zone else Gathering(reach=_CLOSE)
     clear = _CLEAR * NOISE.least
+    if model.error > 0.0:
+        return Gathering(clear=clear if has_pose else 0.0) if has_zone else Gathering(reach=_CLOSE)
     if has_zone:
         return Gathering(rounds=1, anew=False, above=clear, clear=clear, points=_MANY)
     return Gathering(clear=clear, reach=_CLOSE, points=_MANY)

@@ -203,7 +203,7 @@ class Surrogate:
         self.core = core
         self.card: Mapping[str, Any] = MappingProxyType(dict(card))
         self.rows = (3 * frame.loaded[:, None] + np.arange(3)).ravel()
-        self._single_rows: dict[str, NDArray[Any]] = {}  # of the linear part, those asked for last
+        self._wanted: tuple[Ints, Floats] = np.zeros(0, dtype=np.int64), frame.left[:0]  # rows, left's rows
         self._idle = np.setdiff1d(np.arange(len(body.points)), np.union1d(frame.loaded, body.fixed))
 
     @property
@@ -252,20 +252,15 @@ class Surrogate:
         return ReducedSurrogate(self, chosen, self.at_loaded("basis", basis))
 
     def linear_rows(self, rows: Ints, columns: Floats) -> Floats:
-        """Some rows of the linear part of the displacement, (q, k), in single precision: good to 1e-6.
+        """Some rows of the linear part of the displacement, (q, k), for less than the whole.
 
         Args:
             rows: numbers of the wanted components, (q,).
             columns: forces at the loaded nodes, (3l, k), newtons.
         """
-        known = self._single_rows.get("rows")
-        if known is None or not np.array_equal(known, rows):
-            self._single_rows = {"rows": rows, "left": self.frame.left[rows].astype(np.float32)}
-            if self.frame.right is not None:
-                self._single_rows["right"] = self.frame.right.astype(np.float32)
-        forces, right = columns.astype(np.float32), self._single_rows.get("right")
-        found: Floats = (self._single_rows["left"] @ (forces if right is None else right @ forces)).astype(np.float64)
-        return found
+        if not np.array_equal(self._wanted[0], rows):  # each cold frame asks for the same again
+            self._wanted = rows, np.ascontiguousarray(self.frame.left[rows])
+        return self._wanted[1] @ (columns if self.frame.right is None else self.frame.right @ columns)
 
     def with_card(self, **entries: Any) -> Surrogate:
         """The same surrogate with more entries in its card, for instance held-out errors."""
