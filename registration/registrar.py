@@ -41,7 +41,7 @@ _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
 _MANY = 10_000  # points: of no cloud that is left after thinning are there more
 _CLEAR = 2.0  # times the least noise
-_CLOSE = 0.01  # reach of forces whose zone is unknown: with more, their doubt is larger than their error
+_CLOSE = 0.01  # reach of a surrogate's forces whose zone is unknown: with more, their doubt is larger than their error
 _LEADING = 6  # directions of force that a cold start begins with
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
 
@@ -490,7 +490,7 @@ def gathering_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -
         return Gathering(clear=clear if has_pose else 0.0) if has_zone else Gathering(reach=_CLOSE)
     if has_zone:
         return Gathering(rounds=1, anew=False, above=clear, clear=clear, points=_MANY)
-    return Gathering(clear=clear, reach=_CLOSE, points=_MANY)
+    return Gathering(clear=clear, points=_MANY)
 
 
 def expected_force(body: Body, young_modulus: float) -> float:
