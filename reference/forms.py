@@ -113,7 +113,7 @@ class Forms:
     def energy_density(self, u: Any, pressure: Any, parameters: dict[str, Any], gradient: Any = None) -> Any:
         """Strain energy per volume of the cell at rest (UFL)."""
         F = self.space.deformation_gradient(u) if gradient is None else gradient
-        return self.weights * self.material.energy(F, pressure, SimpleNamespace(**parameters))
+        return self.weights * self.material.energy(F, pressure, SimpleNamespace(**parameters), ufl)
 
     def _compile(self) -> None:
         u, pressure = self.split(self.space.state)

@@ -1,4 +1,4 @@
-"""Strain energies of isotropic soft tissue; stress and tangent are derived from them by UFL.
+"""Strain energies of isotropic soft tissue; stress and tangent are derived from them, by UFL or by torch.
 
 Every parameter is a number or an array with one value a cell. A material of one's own is an `Energy`: one function.
 """
@@ -11,11 +11,38 @@ from types import MappingProxyType, SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
-import ufl
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Parameter = float | Floats
+
+
+class Algebra(Protocol):
+    """The functions of 3 x 3 tensors that energies are written in: the module `ufl`, or torch's of `surrogate`."""
+
+    def Identity(self, size: int) -> Any:  # noqa: N802 - UFL's name
+        """The unit tensor."""
+
+    def transpose(self, A: Any) -> Any:
+        """A^T."""
+
+    def dot(self, A: Any, B: Any) -> Any:
+        """The product A B."""
+
+    def sym(self, A: Any) -> Any:
+        """(A + A^T) / 2."""
+
+    def tr(self, A: Any) -> Any:
+        """The trace."""
+
+    def det(self, A: Any) -> Any:
+        """The determinant."""
+
+    def inner(self, A: Any, B: Any) -> Any:
+        """A : B."""
+
+    def ln(self, a: Any) -> Any:
+        """The natural logarithm of a scalar."""
 
 
 class Material(Protocol):
@@ -33,13 +60,14 @@ class Material(Protocol):
     def is_linear(self) -> bool:
         """True when the energy is quadratic in the displacement, so that no cell is ever inside out."""
 
-    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
-        """Strain energy per volume at rest, J/m^3 (with its multiplier, where mixed), in UFL.
+    def energy(self, F: Any, pressure: Any, p: Any, m: Algebra) -> Any:
+        """Strain energy per volume at rest, J/m^3 (with its multiplier, where mixed).
 
         Args:
             F: deformation gradient, 3 x 3.
             pressure: unknown pressure, Pa; None where the material is not mixed.
             p: the parameters as attributes.
+            m: what F is computed with.
         """
 
 
@@ -121,7 +149,7 @@ class _Elastic(_Parameters):
         self._positive("young_modulus")
         self._below_half("poisson_ratio", mixed="IncompressibleNeoHookean")
 
-    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+    def energy(self, F: Any, pressure: Any, p: Any, m: Algebra) -> Any:
         """Strain energy per volume at rest, J/m^3."""
         raise NotImplementedError
 
@@ -131,47 +159,47 @@ class LinearElastic(_Elastic):
 
     is_linear = True
 
-    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+    def energy(self, F: Any, pressure: Any, p: Any, m: Algebra) -> Any:
         """Strain energy per volume at rest, J/m^3."""
         mu, lmbda = lame(p.young_modulus, p.poisson_ratio)
-        e = ufl.sym(F) - ufl.Identity(3)
-        return lmbda / 2 * ufl.tr(e) ** 2 + mu * ufl.inner(e, e)
+        e = m.sym(F) - m.Identity(3)
+        return lmbda / 2 * m.tr(e) ** 2 + mu * m.inner(e, e)
 
 
 class SaintVenantKirchhoff(_Elastic):
     """Saint-Venant-Kirchhoff: psi = lambda/2 (tr E)^2 + mu E : E with the Green-Lagrange strain E (Odot 2023, 2.4)."""
 
-    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+    def energy(self, F: Any, pressure: Any, p: Any, m: Algebra) -> Any:
         """Strain energy per volume at rest, J/m^3."""
         mu, lmbda = lame(p.young_modulus, p.poisson_ratio)
-        E = (F.T * F - ufl.Identity(3)) / 2
-        return lmbda / 2 * ufl.tr(E) ** 2 + mu * ufl.inner(E, E)
+        E = (m.dot(m.transpose(F), F) - m.Identity(3)) / 2
+        return lmbda / 2 * m.tr(E) ** 2 + mu * m.inner(E, E)
 
 
 class NeoHookean(_Elastic):
     """Compressible Neo-Hookean: psi = mu/2 (tr C - 3) - mu ln J + lambda/2 (ln J)^2 (Odot 2023, 2.4)."""
 
-    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+    def energy(self, F: Any, pressure: Any, p: Any, m: Algebra) -> Any:
         """Strain energy per volume at rest, J/m^3."""
         mu, lmbda = lame(p.young_modulus, p.poisson_ratio)
-        ln_J = ufl.ln(ufl.det(F))
-        return mu / 2 * (ufl.inner(F, F) - 3) - mu * ln_J + lmbda / 2 * ln_J**2
+        ln_J = m.ln(m.det(F))
+        return mu / 2 * (m.inner(F, F) - 3) - mu * ln_J + lmbda / 2 * ln_J**2
 
 
-def _isochoric_invariants(F: Any) -> tuple[Any, Any, Any]:
+def _isochoric_invariants(F: Any, m: Algebra) -> tuple[Any, Any, Any]:
     """J_1 and J_2 of C / J^(2/3) (Odot 2023, eq. 2.23), and J."""
-    C, J = F.T * F, ufl.det(F)
-    I1 = ufl.tr(C)
-    return J ** (-2 / 3) * I1, J ** (-4 / 3) * (I1**2 - ufl.inner(C, C)) / 2, J
+    C, J = m.dot(m.transpose(F), F), m.det(F)
+    I1 = m.tr(C)
+    return J ** (-2 / 3) * I1, J ** (-4 / 3) * (I1**2 - m.inner(C, C)) / 2, J
 
 
 class IsochoricNeoHookean(_Elastic):
     """Neo-Hookean with the isochoric-volumetric split: psi = mu/2 (J_1 - 3) + k/2 (J - 1)^2 (Odot 2023, eq. 2.27)."""
 
-    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+    def energy(self, F: Any, pressure: Any, p: Any, m: Algebra) -> Any:
         """Strain energy per volume at rest, J/m^3."""
         mu, _ = lame(p.young_modulus, p.poisson_ratio)
-        J_1, _, J = _isochoric_invariants(F)
+        J_1, _, J = _isochoric_invariants(F, m)
         return mu / 2 * (J_1 - 3) + bulk(p.young_modulus, p.poisson_ratio) / 2 * (J - 1) ** 2
 
 
@@ -211,9 +239,9 @@ class MooneyRivlin(_Parameters):
         half = lame(checked.young_modulus, checked.poisson_ratio)[0] / 2
         return cls(share * half, (1 - share) * half, bulk(checked.young_modulus, checked.poisson_ratio))
 
-    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+    def energy(self, F: Any, pressure: Any, p: Any, m: Algebra) -> Any:
         """Strain energy per volume at rest, J/m^3."""
-        J_1, J_2, J = _isochoric_invariants(F)
+        J_1, J_2, J = _isochoric_invariants(F, m)
         return p.c1 * (J_1 - 3) + p.c2 * (J_2 - 3) + p.bulk_modulus / 2 * (J - 1) ** 2
 
 
@@ -240,9 +268,9 @@ class IncompressibleMooneyRivlin(_Parameters):
         self._positive("c2", zero=True)
         self._positive("compressibility", unit="1/pascals", zero=True)
 
-    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+    def energy(self, F: Any, pressure: Any, p: Any, m: Algebra) -> Any:
         """Strain energy per volume at rest with its multiplier, J/m^3."""
-        J_1, J_2, J = _isochoric_invariants(F)
+        J_1, J_2, J = _isochoric_invariants(F, m)
         constraint = pressure * (J - 1) + p.compressibility / 2 * pressure**2
         return p.c1 * (J_1 - 3) + p.c2 * (J_2 - 3) - constraint
 
@@ -270,9 +298,9 @@ class IncompressibleNeoHookean(_Parameters):
         mu = np.asarray(young_modulus) / (2 * (1 + np.asarray(poisson_ratio)))
         return cls(mu, 3 * (1 - 2 * np.asarray(poisson_ratio)) / np.asarray(young_modulus))
 
-    def energy(self, F: Any, pressure: Any, p: Any) -> Any:
+    def energy(self, F: Any, pressure: Any, p: Any, m: Algebra) -> Any:
         """Strain energy per volume at rest with its multiplier, J/m^3."""
-        J_1, _, J = _isochoric_invariants(F)
+        J_1, _, J = _isochoric_invariants(F, m)
         return p.shear_modulus / 2 * (J_1 - 3) - pressure * (J - 1) - p.compressibility / 2 * pressure**2
 
 
@@ -304,7 +332,7 @@ class Energy:
             checked[name] = values if values.ndim else float(values)
         object.__setattr__(self, "parameters", MappingProxyType(checked))
 
-    def energy(self, F: Any, pressure: Any, p: SimpleNamespace) -> Any:
+    def energy(self, F: Any, pressure: Any, p: SimpleNamespace, m: Algebra) -> Any:
         """Strain energy per volume at rest, J/m^3."""
         return self.function(F, **vars(p))
 

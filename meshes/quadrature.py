@@ -1,0 +1,94 @@
+"""Shape functions of the kinds of cells, and the points and weights that integrate over them."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .elements import Kind
+
+Floats = NDArray[np.float64]
+
+# Keast (1986): 14 points, exact to degree 4; barycentric coordinate that three corners share, weight times 6.
+_KEAST = ((0.1005267652252045, 0.0885898247429807), (0.3143728734931922, 0.1328387466855907))
+_KEAST_MIDDLES = 2.0 / 105.0
+
+
+def quadrature(kind: Kind, degree: int) -> tuple[Floats, Floats]:
+    """Points in the reference cell, (q, d), and weights, (q,), that integrate polynomials of a degree exactly.
+
+    Lines, quadrilaterals and hexahedra by Gauss and Legendre; tetrahedra by one point (degree 1), five (degree 3:
+    Zienkiewicz and Taylor 2000) or fourteen (degree 4: Keast 1986).
+
+    Args:
+        kind: of the cell; its reference cell has corners at 0 and 1.
+        degree: of the polynomials.
+
+    Raises:
+        ValueError: no rule for the kind and degree.
+    """
+    if kind.shape in ("quadrilateral", "hexahedron"):
+        at, weight = np.polynomial.legendre.leggauss((degree + 2) // 2)
+        grid = np.array(list(product(0.5 * (at + 1.0), repeat=kind.dimension)))
+        return grid, np.prod(list(product(0.5 * weight, repeat=kind.dimension)), axis=1)
+    if kind.shape != "tetrahedron" or degree > 4:
+        raise ValueError(f"quadrature: no rule of degree {degree} for a {kind.shape}.")
+    if degree <= 1:
+        return np.full((1, 3), 0.25), np.full(1, 1.0 / 6.0)
+    if degree <= 3:
+        points = np.vstack([np.full((1, 3), 0.25), _alike(1.0 / 6.0)])
+        return points, np.array([-2.0 / 15.0, *[3.0 / 40.0] * 4])
+    middles = np.array([[0.5 * ((i in pair) and i > 0) for i in range(1, 4)] for pair in _PAIRS])
+    points = np.vstack([middles, *(_alike(share) for share, _ in _KEAST)])
+    return points, np.array([_KEAST_MIDDLES] * 6 + [w for _, w in _KEAST for _ in range(4)]) / 6.0
+
+
+_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+
+
+def _alike(share: float) -> Floats:
+    """The four points of a tetrahedron of which three barycentric coordinates are alike."""
+    points = np.full((4, 3), share)
+    points[np.arange(3), np.arange(3)] = 1.0 - 3.0 * share
+    return points
+
+
+def shape_functions(kind: Kind, points: Floats) -> tuple[Floats, Floats]:
+    """Shape functions at points of the reference cell, (q, k), and their gradients there, (q, k, d), in VTK's order.
+
+    Args:
+        kind: of the cell.
+        points: in the reference cell, (q, d).
+    """
+    powers, inverse = _nodal_basis(kind)
+    values = np.prod(points[:, None, :] ** powers, axis=2)
+    slopes = np.empty((len(points), len(powers), kind.dimension))
+    for axis in range(kind.dimension):
+        lower = powers.copy()
+        lower[:, axis] = np.maximum(lower[:, axis] - 1, 0)
+        slopes[:, :, axis] = powers[:, axis] * np.prod(points[:, None, :] ** lower, axis=2)
+    return values @ inverse, np.einsum("qpd,pk->qkd", slopes, inverse)
+
+
+@cache
+def _nodal_basis(kind: Kind) -> tuple[NDArray[np.int64], Floats]:
+    """Powers of the monomials, (k, d), and the matrix from monomials to shape functions, (k, k)."""
+    every = list(product(range(kind.degree + 1), repeat=kind.dimension))
+    is_simplex = kind.shape in ("triangle", "tetrahedron")
+    powers = np.array([p for p in every if not is_simplex or sum(p) <= kind.degree])
+    nodes = reference_nodes(kind)
+    return powers, np.linalg.inv(np.prod(nodes[:, None, :] ** powers, axis=2))
+
+
+def reference_nodes(kind: Kind) -> Floats:
+    """Where the nodes of a kind are in its reference cell, (k, d), in VTK's order."""
+    if kind.shape in ("triangle", "tetrahedron"):
+        corners = np.vstack([np.zeros(kind.dimension), np.eye(kind.dimension)])
+    else:
+        flat = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        layers = [np.column_stack([flat, np.full(4, height)]) for height in (0.0, 1.0)]
+        corners = flat if kind.dimension == 2 else np.vstack(layers)
+    return np.vstack([corners, *(corners[list(group)].mean(axis=0) for group in kind.parents)])

@@ -1,0 +1,166 @@
+"""Energy, internal forces and residual of a body in torch, whole batches at a time: physics for a loss, no FEniCSx."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor, nn
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.elements import linear_kind
+from softtwin.meshes.quadrature import quadrature, shape_functions
+from softtwin.reference.materials import Energy, Material
+
+_DEGREES = {("tetrahedron", 1): 1, ("tetrahedron", 2): 3, ("hexahedron", 1): 3, ("hexahedron", 2): 5}
+_CURVED = 4  # of tetrahedra that are not straight
+
+
+class TorchAlgebra:
+    """The tensor functions that energies are written in (`materials.Algebra`), on the last two axes of a batch.
+
+    Args:
+        like: a tensor of the precision and on the device wanted.
+    """
+
+    def __init__(self, like: Tensor) -> None:
+        self.like = like
+
+    def Identity(self, size: int) -> Tensor:  # noqa: N802 - UFL's name
+        """The unit tensor."""
+        return torch.eye(size, dtype=self.like.dtype, device=self.like.device)
+
+    def transpose(self, A: Tensor) -> Tensor:
+        """A^T."""
+        return A.mT
+
+    def dot(self, A: Tensor, B: Tensor) -> Tensor:
+        """The product A B."""
+        return A @ B
+
+    def sym(self, A: Tensor) -> Tensor:
+        """(A + A^T) / 2."""
+        return 0.5 * (A + A.mT)
+
+    def tr(self, A: Tensor) -> Tensor:
+        """The trace."""
+        return A.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+
+    def det(self, A: Tensor) -> Tensor:
+        """The determinant of 3 x 3."""
+        return (A[..., 0, :] * torch.linalg.cross(A[..., 1, :], A[..., 2, :])).sum(dim=-1)
+
+    def inner(self, A: Tensor, B: Tensor) -> Tensor:
+        """A : B."""
+        return (A * B).sum(dim=(-2, -1))
+
+    def ln(self, a: Tensor) -> Tensor:
+        """The natural logarithm; NaN where a cell is inside out."""
+        return a.log()
+
+
+class ElasticBody(nn.Module):
+    """A body of one compressible material, its displacements in batches, (s, n, 3), metres.
+
+    The same cells, quadrature and energies as the reference's `Problem`; `to` moves it to a device or a precision.
+
+    Args:
+        body: the body, in space.
+        material: strain energy; not mixed, and not an own `Energy`, which is written in UFL.
+        weights: factor of each cell's energy, (cells,), the part of the cell that is filled; 1 if not given.
+
+    Raises:
+        ValueError: a plane body, a material of the kinds above, or weights of another shape.
+    """
+
+    gradients: Tensor
+    volumes: Tensor
+    cells: Tensor
+    free: Tensor
+
+    def __init__(self, body: Body, material: Material, weights: ArrayLike | None = None) -> None:
+        super().__init__()
+        if body.dimension != 3:
+            raise ValueError(f"ElasticBody.body: expected a body in space, got one of {body.dimension} dimensions.")
+        if material.is_mixed or isinstance(material, Energy):
+            raise ValueError(
+                f"ElasticBody.material: expected a compressible law of this package, got {type(material).__name__}."
+            )
+        part = np.ones(len(body.cells)) if weights is None else np.asarray(weights, dtype=np.float64)
+        if part.shape != (len(body.cells),):
+            raise ValueError(f"ElasticBody.weights: expected shape ({len(body.cells)},), got {part.shape}.")
+        self.material, self.nodes = material, len(body.points)
+        degree = _CURVED if body.kind.shape == "tetrahedron" and not body.is_straight else _DEGREES[_key(body)]
+        points, factors = quadrature(body.kind, degree)
+        shaped = linear_kind(body.kind) if body.is_straight else body.kind
+        corners = body.points[body.cells[:, : shaped.nodes]]
+        jacobians = np.einsum("cki,qkj->cqij", corners, shape_functions(shaped, points)[1])
+        slopes = shape_functions(body.kind, points)[1]
+        gradients = np.einsum("qkj,cqji->cqki", slopes, np.linalg.inv(jacobians))
+        self.register_buffer("gradients", torch.from_numpy(gradients))
+        self.register_buffer("volumes", torch.from_numpy(part[:, None] * factors * np.linalg.det(jacobians)))
+        self.register_buffer("cells", torch.from_numpy(body.cells.astype(np.int64)))
+        is_free = np.ones((self.nodes, 1))
+        is_free[body.fixed] = 0.0
+        self.register_buffer("free", torch.from_numpy(is_free))
+        for name, value in material.parameters.items():
+            values = np.asarray(value, dtype=np.float64)
+            if values.shape not in ((), (len(body.cells),)):
+                raise ValueError(
+                    f"ElasticBody.material.{name}: expected a number or one for each of the {len(body.cells)} cells, "
+                    f"got shape {values.shape}."
+                )
+            self.register_buffer(f"parameter_{name}", torch.from_numpy(values.reshape(-1, 1).copy()))
+
+    def deformation_gradients(self, displacement: Tensor) -> Tensor:
+        """F at the points of the quadrature, (s, cells, q, 3, 3)."""
+        nodal = displacement[:, self.cells]
+        unit = torch.eye(3, dtype=self.gradients.dtype, device=self.gradients.device)
+        return unit + torch.einsum("scki,cqkj->scqij", nodal, self.gradients)
+
+    def jacobians(self, displacement: Tensor) -> Tensor:
+        """Det F there, (s, cells, q): not positive where a cell is inside out."""
+        F = self.deformation_gradients(displacement)
+        return TorchAlgebra(F).det(F)
+
+    def energy(self, displacement: Tensor) -> Tensor:
+        """Strain energy, (s,), joules; NaN where the law is none for a cell inside out."""
+        F = self.deformation_gradients(displacement)
+        return (self._density(F) * self.volumes).sum(dim=(1, 2))
+
+    def internal_forces(self, displacement: Tensor) -> Tensor:
+        """Derivative of the strain energy, (s, n, 3), newtons; itself differentiable."""
+        F = self.deformation_gradients(displacement)
+        is_differentiated = F.requires_grad
+        with torch.enable_grad():
+            at = F if is_differentiated else F.requires_grad_()
+            (stress,) = torch.autograd.grad(self._density(at).sum(), at, create_graph=is_differentiated)
+        shares = torch.einsum("scqij,cqkj,cq->scki", stress, self.gradients, self.volumes)
+        forces = torch.zeros(len(F), self.nodes, 3, dtype=F.dtype, device=F.device)
+        return forces.index_add(1, self.cells.reshape(-1), shares.reshape(len(F), -1, 3))
+
+    def residual(self, displacement: Tensor, forces: Tensor) -> Tensor:
+        """Out-of-balance forces at the free nodes relative to the forces there, |R(u) - b| / |b|, (s,).
+
+        Args:
+            displacement: u, (s, n, 3), metres.
+            forces: b, (s, n, 3), newtons.
+        """
+        missing = (self.internal_forces(displacement) - forces) * self.free
+        sizes = torch.linalg.vector_norm(forces * self.free, dim=(1, 2))
+        return torch.linalg.vector_norm(missing, dim=(1, 2)) / sizes
+
+    def potential(self, displacement: Tensor, forces: Tensor) -> Tensor:
+        """Strain energy less the work of dead forces, (s,), joules: least in equilibrium."""
+        return self.energy(displacement) - (forces * displacement).sum(dim=(1, 2))
+
+    def _density(self, F: Tensor) -> Tensor:
+        named = {name: getattr(self, f"parameter_{name}") for name in self.material.parameters}
+        density: Tensor = self.material.energy(F, None, SimpleNamespace(**named), TorchAlgebra(F))
+        return density
+
+
+def _key(body: Body) -> tuple[str, int]:
+    return body.kind.shape, body.kind.degree

@@ -1,0 +1,146 @@
+"""Energy, internal forces and residual in torch: the reference's to rounding, and physics that needs no reference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.shapes import beam
+from softtwin.reference.materials import (
+    Energy,
+    IncompressibleNeoHookean,
+    IsochoricNeoHookean,
+    LinearElastic,
+    Material,
+    MooneyRivlin,
+    NeoHookean,
+    SaintVenantKirchhoff,
+)
+from softtwin.surrogate.residual import ElasticBody
+
+LAWS: dict[str, Material] = {
+    "linear": LinearElastic(4500.0, 0.3),
+    "Saint-Venant-Kirchhoff": SaintVenantKirchhoff(4500.0, 0.45),
+    "Neo-Hookean": NeoHookean(4500.0, 0.45),
+    "isochoric Neo-Hookean": IsochoricNeoHookean(4500.0, 0.49),
+    "Mooney-Rivlin": MooneyRivlin.from_elastic(4500.0, 0.45),
+}
+KINDS = ["tetrahedron", "hexahedron"]
+
+
+def body_of(kind: str, degree: int = 1, curved: bool = False) -> Body:
+    made = beam((3, 2, 2), (1.0, 0.25, 0.25), "tetrahedron" if kind == "tetrahedron" else "hexahedron")
+    made = made.quadratic() if degree == 2 else made
+    points = made.points + 0.01 * np.sin(7.0 * made.points[:, [1, 2, 0]]) if curved else made.points
+    return Body(points, made.cells, made.node_sets)
+
+
+def some_displacement(body: Body, rng: np.random.Generator, size: float = 0.02) -> np.ndarray:
+    return size * np.sin(5.0 * body.points @ rng.standard_normal((3, 3)))
+
+
+def batch(*fields: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.stack(fields))
+
+
+@pytest.mark.fenicsx
+@pytest.mark.parametrize("law", LAWS.values(), ids=list(LAWS))
+@pytest.mark.parametrize(
+    ("kind", "degree", "curved"), [(k, d, c) for k in KINDS for d, c in ((1, False), (2, False), (2, True))]
+)
+def test_energy_and_forces_are_the_references(law: Material, kind: str, degree: int, curved: bool, rng) -> None:
+    from softtwin.reference.equilibrium import Problem
+
+    body = body_of(kind, degree, curved)
+    weights = rng.uniform(0.3, 1.0, len(body.cells))
+    fields = [some_displacement(body, rng) for _ in range(2)]
+    physics = ElasticBody(body, law, weights)
+    energies, forces = physics.energy(batch(*fields)).numpy(), physics.internal_forces(batch(*fields)).numpy()
+    with Problem(body, law, weights=weights) as problem:
+        for field, energy, force in zip(fields, energies, forces, strict=True):
+            expected = problem.internal_forces(field)
+            assert energy == pytest.approx(problem.energy(field), rel=1e-10)
+            np.testing.assert_allclose(force, expected, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.fenicsx
+def test_each_cell_has_its_own_parameters_and_equilibria_have_no_residual(rng) -> None:
+    from softtwin.reference.equilibrium import NewtonOptions, Problem
+
+    body = body_of("hexahedron")
+    law = NeoHookean(rng.uniform(3e3, 6e3, len(body.cells)), 0.45)
+    forces = np.zeros_like(body.points)
+    forces[body.node_sets["tip"]] = [0.0, 0.1, -0.3]
+    with Problem(body, law, NewtonOptions(tolerance=1e-10)) as problem:
+        found = problem.solve(forces).displacement
+    physics = ElasticBody(body, law)
+    residuals = physics.residual(batch(found, 1.01 * found), batch(forces, forces)).numpy()
+    assert residuals[0] < 1e-9 and residuals[1] > 1e-3
+    potentials = physics.potential(batch(found, 1.01 * found, 0.99 * found), batch(*[forces] * 3))
+    assert potentials.argmin() == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("law", LAWS.values(), ids=list(LAWS))
+def test_forces_are_the_derivative_of_the_energy(law: Material, kind: str, rng) -> None:
+    body = body_of(kind, 2)
+    physics, fields = ElasticBody(body, law), batch(*(some_displacement(body, rng) for _ in range(3)))
+    fields.requires_grad_()
+    (slopes,) = torch.autograd.grad(physics.energy(fields).sum(), fields)
+    torch.testing.assert_close(physics.internal_forces(fields).detach(), slopes, rtol=0.0, atol=1e-10)
+
+
+def test_the_residual_can_be_a_loss(rng) -> None:
+    """Its derivative by the displacement, for training, against central differences; the weights of a body on another
+    device or in another precision come along with `to`."""
+    body = body_of("hexahedron")
+    physics = ElasticBody(body, LAWS["Neo-Hookean"])
+    u, b = batch(some_displacement(body, rng)), batch(0.1 * rng.standard_normal(body.points.shape))
+    u.requires_grad_()
+    (slope,) = torch.autograd.grad(physics.residual(u, b).sum(), u)
+    way, step = batch(rng.standard_normal(body.points.shape)), 1e-6
+    with torch.no_grad():
+        ahead, behind = (physics.residual(u + sign * step * way, b) for sign in (1.0, -1.0))
+    assert float((slope * way).sum()) == pytest.approx(float(ahead - behind) / (2.0 * step), rel=1e-6)
+    single = physics.to(torch.float32)
+    assert single.energy(u.detach().float()).dtype == torch.float32
+
+
+@pytest.mark.parametrize("law", LAWS.values(), ids=list(LAWS))
+def test_a_rigid_motion_costs_nothing_but_in_the_linear_law(law: Material) -> None:
+    body = body_of("tetrahedron")
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    moved = body.points @ turn.T + 0.3 - body.points
+    energies = ElasticBody(body, law).energy(batch(np.zeros_like(moved), np.full_like(moved, 0.3), moved)).numpy()
+    np.testing.assert_allclose(energies[:2], 0.0, atol=1e-10)
+    assert (abs(energies[2]) > 1.0) == isinstance(law, LinearElastic)
+
+
+def test_a_cell_inside_out_shows(rng) -> None:
+    body = body_of("tetrahedron")
+    turned = -2.0 * body.points * [1.0, 0.0, 0.0]
+    physics = ElasticBody(body, LAWS["Neo-Hookean"])
+    jacobians = physics.jacobians(batch(np.zeros_like(turned), turned))
+    torch.testing.assert_close(jacobians[0], torch.ones_like(jacobians[0]))
+    assert bool((jacobians[1] < 0.0).all()) and bool(physics.energy(batch(turned)).isnan().all())
+
+
+@pytest.mark.parametrize(
+    ("law", "weights", "message"),
+    [
+        (IncompressibleNeoHookean(1500.0), None, "ElasticBody.material: expected a compressible law"),
+        (Energy(lambda F, mu: mu, {"mu": 1.0}), None, "ElasticBody.material: expected a compressible law"),
+        (NeoHookean(4500.0, 0.45), np.ones(3), r"ElasticBody.weights: expected shape \(12,\), got \(3,\)"),
+        (
+            NeoHookean(np.ones(3), 0.45),
+            None,
+            r"ElasticBody.material.young_modulus: expected .* 12 cells, got shape \(3,\)",
+        ),
+    ],
+)
+def test_what_is_no_batch_of_equilibria_is_refused(law: Material, weights: np.ndarray | None, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ElasticBody(body_of("hexahedron"), law, weights)
