@@ -37,19 +37,7 @@ from .loading import checked_array
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Points a cell: 1 for linear tetrahedra, 2 x 2 x 2 for linear and 3 x 3 x 3 for quadratic hexahedra, 6 for quadratic
-# tetrahedra. UFL's own estimate makes a Q1 Neo-Hookean tangent 66 to 127 times dearer.
-_DEGREES = {("simplex", 1): 1, ("simplex", 2): 3, ("cube", 1): 3, ("cube", 2): 5}
-_MIXED_DEGREES = {"simplex": 4, "cube": 5}
 _AXES = "xyz"
-
-
-def quadrature_degree(body: Body, mixed: bool) -> int:
-    """The degree of the quadrature that a body's cells are integrated with."""
-    family = "simplex" if body.kind.shape in ("triangle", "tetrahedron") else "cube"
-    if family == "simplex" and not body.is_straight:
-        return 4
-    return _MIXED_DEGREES[family] if mixed else _DEGREES[family, body.kind.degree]
 
 
 class Discretisation:

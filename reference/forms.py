@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softtwin.meshes.quadrature import quadrature_degree
+
 from .assembly import CellSum, suits
-from .discretisation import Discretisation, quadrature_degree
+from .discretisation import Discretisation
 from .fenicsx import (
     CellMatrices,
     add_matrix,

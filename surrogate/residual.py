@@ -11,11 +11,8 @@ from torch import Tensor, nn
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.elements import linear_kind
-from softtwin.meshes.quadrature import quadrature, shape_functions
+from softtwin.meshes.quadrature import quadrature, quadrature_degree, shape_functions
 from softtwin.reference.materials import Energy, Material
-
-_DEGREES = {("tetrahedron", 1): 1, ("tetrahedron", 2): 3, ("hexahedron", 1): 3, ("hexahedron", 2): 5}
-_CURVED = 4  # of tetrahedra that are not straight
 
 
 class TorchAlgebra:
@@ -92,8 +89,7 @@ class ElasticBody(nn.Module):
         if part.shape != (len(body.cells),):
             raise ValueError(f"ElasticBody.weights: expected shape ({len(body.cells)},), got {part.shape}.")
         self.material, self.nodes = material, len(body.points)
-        degree = _CURVED if body.kind.shape == "tetrahedron" and not body.is_straight else _DEGREES[_key(body)]
-        points, factors = quadrature(body.kind, degree)
+        points, factors = quadrature(body.kind, quadrature_degree(body))
         shaped = linear_kind(body.kind) if body.is_straight else body.kind
         corners = body.points[body.cells[:, : shaped.nodes]]
         jacobians = np.einsum("cki,qkj->cqij", corners, shape_functions(shaped, points)[1])
@@ -160,7 +156,3 @@ class ElasticBody(nn.Module):
         named = {name: getattr(self, f"parameter_{name}") for name in self.material.parameters}
         density: Tensor = self.material.energy(F, None, SimpleNamespace(**named), TorchAlgebra(F))
         return density
-
-
-def _key(body: Body) -> tuple[str, int]:
-    return body.kind.shape, body.kind.degree
