@@ -22,17 +22,15 @@ from softtwin.reference.loads import loaded_nodes
 from softtwin.reference.outcome import NotConverged
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel, State
-from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import (
     NOISE,
-    Gathering,
     Registrar,
     Registration,
     RegistrationOptions,
     expected_force,
-    gathering_for,
+    options_for,
     prepare,
 )
 from softtwin.registration.rigid import align
@@ -275,7 +273,7 @@ class Twin:
         body, section = self.body, self.config.registration
         if camera is not None:
             plain = self.registrar(zone)
-            options = _options(section, gathering_for(self.model, bool(zone), has_pose=True))
+            options = _options(section, options_for(self.model, bool(zone), has_pose=True))
             return Registrar(self.model, plain.observed, plain.forces, options, pose=camera)
         if zone and zone not in body.node_sets:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
@@ -286,7 +284,7 @@ class Twin:
             force_scale=section.force_scale or expected_force(body, self.config.material.young_modulus),
             smoothness=section.smoothness,
             directions=section.directions,
-            options=_options(section, gathering_for(self.model, bool(zone))),
+            options=_options(section, options_for(self.model, bool(zone))),
         )
 
 
@@ -340,12 +338,13 @@ class Sequence:
         return self._count - 1
 
 
-def _options(section: RegistrationSection, gathering: Gathering) -> RegistrationOptions:
+def _options(section: RegistrationSection, suited: RegistrationOptions) -> RegistrationOptions:
     spread = 0.0 if section.noise_known else NOISE.spread
     noise = Scale(section.noise, spread, least=min(NOISE.least, section.noise))
-    solver = LBFGS() if section.solver == "l-bfgs" else GaussNewton()
+    solver = LBFGS() if section.solver == "l-bfgs" else suited.solver
     if section.max_iterations:
         solver = replace(solver, max_iterations=section.max_iterations)
+    gathering = suited.gathering
     if section.rounds >= 0:
         gathering = replace(gathering, rounds=section.rounds)
     return RegistrationOptions(noise, solver, section.points, gathering)

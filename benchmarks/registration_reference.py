@@ -22,7 +22,7 @@ from softtwin.registration.forward import ForwardModel
 from softtwin.registration.registrar import (
     RegistrationOptions,
     expected_force,
-    gathering_for,
+    options_for,
     prepare,
     register_sequence,
 )
@@ -108,7 +108,7 @@ def main() -> None:
         for name in arguments.sequences:
             data = sequence(name, arguments.mesh)
             model = ReferenceModel(problem, patient=False)
-            options = RegistrationOptions(gathering=gathering_for(model, has_zone=True))
+            options = options_for(model, has_zone=True)
             rows = run(data, model, arguments.frames, options, arguments.smoothness)
             figures["sequences"][name] = {"summary": summary(rows), "frames": rows}
             print(name, {key: round(value, 4) for key, value in summary(rows).items()}, flush=True)

@@ -32,9 +32,8 @@ from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import (
     Registrar,
     Registration,
-    RegistrationOptions,
     expected_force,
-    gathering_for,
+    options_for,
     prepare,
 )
 from softtwin.registration.unknowns import PosePrior
@@ -116,7 +115,7 @@ def registrar_for(
         zone,
         model.body.surfaces["observed"],
         force_scale=expected_force(model.body, YOUNG_MODULUS),
-        options=RegistrationOptions(gathering=gathering_for(model, zoned, pose is not None)),
+        options=options_for(model, zoned, pose is not None),
         pose=pose,
     )
 

@@ -19,6 +19,7 @@ from .problem import Problem, Trial
 
 Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
+_EXACTLY = 0.25
 _KEPT = 0.2  # a whole step that misses its promise by less: where only a start is wanted, it was the last
 _TRUSTED = 3.0  # deviations
 _UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
@@ -110,6 +111,10 @@ class GaussNewton:
         few = min(self.max_iterations, _ROUGH)
         return replace(self, losses=self.losses[:1], settled=self.handed_on, max_iterations=few)
 
+    def exactly(self) -> GaussNewton:
+        """The same, ended later: one step of many may be short and lie in a direction that the cloud tells well."""
+        return replace(self, settled=_EXACTLY * self.settled)
+
     def last(self) -> GaussNewton:
         """The same with the last loss alone: from where all have been."""
         return replace(self, losses=self.losses[-1:])
@@ -147,7 +152,7 @@ class _Search:
         self.options, self.problem = options, problem
         self.trial = _begun(problem, start, near)
         self.evaluations, self.limit = 1, options.max_step
-        self.noise = max(robust_deviation(self.trial.match.distances), problem.noise.least)
+        self.noise, self.own = max(robust_deviation(self.trial.match.distances), problem.noise.least), 0.0
         self.trace: list[Step] = []
         self._at: LocalModel | None = None
 
@@ -164,8 +169,8 @@ class _Search:
         at = self._at
         if at is None or at.trial is not self.trial or at.loss is not loss:
             jacobian = None if at is None or at.trial is not self.trial else at.jacobian
-            at = LocalModel(self.problem, self.trial, loss, self.noise, self.options.graduation, jacobian)
-            self._at, self.noise = at, at.scales.noise
+            at = LocalModel(self.problem, self.trial, loss, self.noise, self.options.graduation, jacobian, self.own)
+            self._at, self.noise, self.own = at, at.noise, at.own
         return at
 
     def _descend(self, loss: Loss, settled: float) -> Outcome:
@@ -191,7 +196,7 @@ class _Search:
         again = self.problem.again(self.trial, self.options.trusted * robust_deviation(before))
         if np.abs(again.match.distances - before).max() >= _UNCHANGED * self.noise:
             self.trial = again
-        return local.length_for(again.match.distances) < settled
+        return local.length_for(again) < settled
 
     def _step(self, local: LocalModel, loss: Loss) -> Outcome | None:
         """Take the best step within the limit; None when one was taken."""
@@ -242,6 +247,7 @@ class LocalModel:
         noise: their scale so far, metres, for the weights that the scales are found with.
         graduation: the noise is taken as at least this part of what the linear model promises to change.
         jacobian: of the distances at the trial, (p, k), where it is known.
+        own: the points' own noise so far, metres, without what is yet to be explained; None for all of it.
     """
 
     def __init__(
@@ -252,37 +258,41 @@ class LocalModel:
         noise: float,
         graduation: float = 0.0,
         jacobian: Floats | None = None,
+        own: float | None = None,
     ) -> None:
         self.problem, self.trial, self.loss = problem, trial, loss
+        self.own = noise if own is None else own
         self.was_whole = True
-        distances, left_out = trial.match.distances, problem.left_out(trial)
+        left_out = problem.left_out(trial)
         self.jacobian = problem.jacobian(trial) if jacobian is None else jacobian
         self.scales, self.is_graduated = self._found_scales(loss, noise, left_out, graduation)
         self.noise = self.scales.noise
         self.deviations = np.hypot(self.noise, left_out)
-        self.weights = loss.weight(distances / self.deviations)
+        residuals = problem.residuals(trial, self.own)
+        self.weights = loss.weight(residuals / self.deviations)
         self.precision = np.ones(problem.size)
         self.precision[problem.force_part] = 1.0 / self.scales.force**2
         trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
         self.information = trusted.T @ trusted
         self._hessian = self.information + np.diag(self.precision)
-        self.gradient = self._gradient(distances, self.weights)
+        self.gradient = self._gradient(residuals, self.weights)
         self.value = self.objective(trial, loss)
 
-    def _gradient(self, distances: Floats, weights: Floats) -> Floats:
-        by_distances = weights * distances / self.deviations**2
+    def _gradient(self, residuals: Floats, weights: Floats) -> Floats:
+        by_distances = weights * residuals / self.deviations**2
         return by_distances @ self.jacobian + self.precision * self.trial.coefficients
 
     def _found_scales(self, loss: Loss, noise: float, left_out: Floats, graduation: float) -> tuple[Scales, bool]:
-        """Scales, and whether the noise is held above what the linear model alone would believe."""
+        """Scales, and whether the noise is held above what the linear model alone would believe: the points' own."""
         problem, part = self.problem, self.problem.force_part
         beside = self.jacobian[:, part.stop :], self.trial.coefficients[part.stop :]
-        coefficients, residuals = self.trial.coefficients[part], self.trial.match.distances
+        coefficients, residuals = self.trial.coefficients[part], problem.residuals(self.trial, self.own)
         deviations = np.hypot(noise, left_out)
         weights, shares = loss.weight(residuals / deviations), (noise / deviations) ** 2
         jacobian = self.jacobian[:, part]
         local = linearised(jacobian, residuals, weights, coefficients, loss.consistency, noise, beside, shares)
         scales = find_scales(local, problem.noise, problem.forces.scale)
+        self.own = scales.noise
         least = graduation * local.promised(scales, coefficients)
         if least <= scales.noise:
             return scales, False
@@ -317,16 +327,17 @@ class LocalModel:
     def objective(self, trial: Trial, loss: Loss) -> float:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ trial.coefficients**2)
-        return float(loss.value(trial.match.distances / self.deviations).sum()) + prior
+        return float(loss.value(self.problem.residuals(trial, self.own) / self.deviations).sum()) + prior
 
     @property
     def length(self) -> float:
         """Length of the whole step in posterior deviations a coefficient."""
         return _length(self._whole, self.gradient)
 
-    def length_for(self, distances: Floats) -> float:
-        """The same were the points as far from the surface as given, (p,), metres, with these derivatives."""
-        gradient = self._gradient(distances, self.loss.weight(distances / self.deviations))
+    def length_for(self, trial: Trial) -> float:
+        """The same at a trial of the same coefficients with other closest points, with these derivatives."""
+        residuals = self.problem.residuals(trial, self.own)
+        gradient = self._gradient(residuals, self.loss.weight(residuals / self.deviations))
         return _length(self._whole_for(gradient), gradient)
 
     def _damped(self, damping: float) -> Floats:
@@ -354,7 +365,8 @@ class LocalModel:
 
     def posterior(self) -> Posterior:
         """Laplace's approximation at the trial."""
-        return posterior(self.information, self.precision, self.trial.coefficients, self.scales)
+        count = self.problem.forces.size
+        return posterior(self.information, self.precision, self.trial.coefficients, self.scales, count)
 
 
 def _length(step: Floats, gradient: Floats) -> float:

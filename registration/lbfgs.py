@@ -109,7 +109,7 @@ class _Run:
             except NotConverged:  # a wall that the line search steps back from
                 met_wall = True
                 return _WALL * max(least, 1.0), np.zeros_like(scaled)
-            value, gradient = _objective(problem, trial, loss, local.deviations)
+            value, gradient = _objective(problem, trial, loss, local)
             value += 0.5 * float(scaled @ scaled)
             if value < least:
                 least, self.best = value, trial
@@ -129,8 +129,8 @@ class _Run:
         return Outcome.REFUSED if met_wall else Outcome.NO_DESCENT
 
 
-def _objective(problem: Problem, trial: Trial, loss: Loss, deviations: Floats) -> tuple[float, Floats]:
-    """Robust distances and their gradient by the coefficients, (k,)."""
-    scaled = trial.match.distances / deviations
-    slope = loss.weight(scaled) * scaled / deviations
+def _objective(problem: Problem, trial: Trial, loss: Loss, local: LocalModel) -> tuple[float, Floats]:
+    """Robust distances and their gradient by the coefficients, (k,), at the scales of a model."""
+    scaled = problem.residuals(trial, local.own) / local.deviations
+    slope = loss.weight(scaled) * scaled / local.deviations
     return float(loss.value(scaled).sum()), problem.pulled(trial, slope)

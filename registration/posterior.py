@@ -36,14 +36,21 @@ class Posterior:
         return net @ inner @ net.T + self.scales.force**2 * forces.left_out
 
 
-def posterior(information: Floats, precision: Floats, mean: Floats, scales: Scales) -> Posterior:
+def posterior(information: Floats, precision: Floats, mean: Floats, scales: Scales, forces: int) -> Posterior:
     """The posterior for the information of the points, (k, k), and the prior's precision, (k,).
+
+    The force scale is found from the same cloud: how far its own doubt moves the mean is part of the covariance (Kass
+    and Steffey 1989).
 
     Args:
         information: J^T W J with the weights over the variances, per squared unit of the coefficients.
         precision: of the prior, (k,).
         mean: the coefficients found, (k,).
         scales: noise and force scale.
+        forces: number of coefficients that the force scale belongs to, the first.
     """
     covariance = np.linalg.inv(information + np.diag(precision))
-    return Posterior(mean, covariance, scales, float(np.einsum("ij,ji->", covariance, information)))
+    by_scale = 2.0 * covariance[:, :forces] @ (precision * mean)[:forces]  # of the mean, by the logarithm of the scale
+    moved = scales.spread[1] * by_scale
+    informed = float(np.einsum("ij,ji->", covariance, information))
+    return Posterior(mean, covariance + np.outer(moved, moved), scales, informed)

@@ -134,6 +134,15 @@ class Problem:
         alike = max(len(self.cloud) / self.error.discrepancy.places, 1.0)
         return np.sqrt(alike) * np.einsum("pk,pk->p", trial.match.weights, corners)
 
+    def residuals(self, trial: Trial, noise: float) -> Floats:
+        """Distances less what they are in the mean for points of some noise, (p,), metres.
+
+        Args:
+            trial: at some coefficients.
+            noise: standard deviation of each coordinate of a point, metres.
+        """
+        return trial.match.distances - self.observed.expected(trial.match, noise)
+
     def again(self, trial: Trial, beyond: float = 0.0) -> Trial:
         """The same trial with closest points searched anew.
 

@@ -52,8 +52,6 @@ class Gathering:
 
     Args:
         rounds: how often.
-        anew: each round begins at rest and not where the one before ended: safer, and as many solves again.
-        above: clouds of less noise tell the place of the forces themselves, metres.
         clear: clouds of less noise tell the size of the forces, whatever was expected of it, metres.
         reach: forces within this part of the body's size are gathered together.
         informed: which directions are kept of gathered forces.
@@ -61,8 +59,6 @@ class Gathering:
     """
 
     rounds: int = 2
-    anew: bool = True
-    above: float = 0.0
     clear: float = 0.0
     reach: float = 0.035
     informed: Informed = field(default_factory=Informed)
@@ -288,28 +284,15 @@ class Registrar:
     def _cold(self, points: Floats, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more for each round of gathering them."""
         prepared, gathering, solver = self._everywhere, self.options.gathering, self.options.solver
-        few, is_settled = _thinned(points, gathering.points), gathering.anew or not gathering.rounds
-        first = solver if is_settled else solver.unsettled()
-        found = self._from_rest(few if gathering.rounds else points, prepared, first)
+        few, is_gathered = _thinned(points, gathering.points), gathering.rounds > 0
+        begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
+        found = self._from_rest(*begun)
         for left in reversed(range(gathering.rounds)):
-            if self._is_hopeless(found) or found.posterior.scales.noise < gathering.above:
+            if self._is_hopeless(found):
                 break
-            size, some = prepared.forces.size, few if left else points
-            nodal = prepared.forces.forces(found.trial.coefficients[:size])
-            prepared = self._gathered(nodal)
-            found = _after(found, self._again(some, prepared, nodal, found.trial.coefficients[size:], found))
-            is_settled = True
-        return self._finished(points, prepared, found, begin, is_settled)
-
-    def _again(self, points: Floats, prepared: Prepared, nodal: Floats, others: Floats, found: Found) -> Found:
-        """With gathered forces: from rest, or where that is dear from the nodal forces and other unknowns found."""
-        if self.options.gathering.anew:
-            return self._from_rest(points, prepared, self.options.solver)
-        start = np.concatenate([prepared.forces.nearest(nodal), others])
-        try:
-            return self.options.solver.solve(self._plain(points, prepared), start, found.trial)
-        except NotConverged:
-            return self._from_rest(points, prepared, self.options.solver)
+            prepared = self._gathered(prepared.forces.forces(found.trial.coefficients[: prepared.forces.size]))
+            found = _after(found, self._from_rest(few if left else points, prepared, solver))
+        return self._finished(points, prepared, found, begin, is_gathered)
 
     def _from_rest(self, points: Floats, prepared: Prepared, solver: GaussNewton | LBFGS) -> Found:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
@@ -474,23 +457,27 @@ def prepare(
     return Registrar(model, observed, forces, options, pose=pose)
 
 
-def gathering_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> Gathering:
-    """How forces are gathered: an exact model's solves are dear, and a clear cloud tells it where a zone is pulled.
+def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> RegistrationOptions:
+    """Options that suit a model.
 
-    What a surrogate gets wrong could be taken for large forces; where the pose is unknown, forces that are expected
-    small would be taken for a turn of the organ, which is worse.
+    Within a zone forces are not gathered: what a cloud was used to believe it would be used to find once more. An exact
+    model is only as good as the end of the descent. What a surrogate gets wrong could be taken for large forces, so a
+    clear cloud is not left to tell their size; but where the pose is unknown, forces that are expected small would be
+    taken for a turn of the organ, which is worse.
 
     Args:
         model: forward model.
         has_zone: the nodes that may carry force are those that a tool can touch.
         has_pose: the pose is unknown.
     """
-    clear = _CLEAR * NOISE.least
-    if model.error > 0.0:
-        return Gathering(clear=clear if has_pose else 0.0) if has_zone else Gathering(reach=_CLOSE)
+    clear, is_exact = _CLEAR * NOISE.least, model.error == 0.0
+    if is_exact:
+        gathering = Gathering(clear=clear, points=_MANY)
+    else:
+        gathering = Gathering(clear=clear if has_zone and has_pose else 0.0, reach=_CLOSE)
     if has_zone:
-        return Gathering(rounds=1, anew=False, above=clear, clear=clear, points=_MANY)
-    return Gathering(clear=clear, points=_MANY)
+        gathering = replace(gathering, rounds=0)
+    return RegistrationOptions(solver=GaussNewton().exactly() if is_exact else GaussNewton(), gathering=gathering)
 
 
 def expected_force(body: Body, young_modulus: float) -> float:

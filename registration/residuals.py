@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from softtwin.meshes.body import Body
+from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.closest import ClosestPoints
+from softtwin.meshes.curvature import mean_curvature
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -121,6 +122,25 @@ class SurfaceDistance:
         values = (match.weights[:, :, None] * match.directions[:, None, :]).reshape(count, 9)
         indptr = np.arange(0, 9 * count + 1, 9)
         return csr_array((values.ravel(), columns.ravel(), indptr), shape=(count, 3 * len(self.nodes)))
+
+    def expected(self, match: Match, noise: float) -> Floats:
+        """Mean of the signed distances of points that noise has moved from where they were matched, (p,), metres.
+
+        Noise leaves more points outside a round surface than inside: by sigma^2 H where the mean curvature H is small
+        (the second-order mean of the distance) and by sigma sqrt(8 / pi) about a tip, which has no inside. Noise is
+        taken as the same in all directions, curvature as at rest.
+
+        Args:
+            match: of the cloud.
+            noise: standard deviation of each coordinate of a point, metres.
+        """
+        bent = noise * np.einsum("pk,pk->p", match.weights, self._curvature[self.triangles[match.triangles]])
+        mean: Floats = -noise * bent / (1.0 + np.sqrt(np.pi / 8.0) * np.abs(bent))
+        return mean
+
+    @cached_property
+    def _curvature(self) -> Floats:
+        return mean_curvature(Surface(self.rest, self.triangles))
 
     @cached_property
     def normals(self) -> tuple[Floats, Floats]:

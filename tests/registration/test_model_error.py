@@ -12,7 +12,7 @@ from softtwin.registration.evidence import Scale, linearised
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.pose import Pose
 from softtwin.registration.problem import Problem, Trial
-from softtwin.registration.registrar import Registrar, RegistrationOptions, gathering_for
+from softtwin.registration.registrar import Registrar, options_for
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import ModelError, PosePrior, nodal_forces
 
@@ -94,7 +94,7 @@ def test_doubt_of_the_net_force_knows_of_the_models_error(body: Body) -> None:
 def test_a_clear_cloud_of_an_unknown_pose_tells_the_size_of_forces(body: Body, rng, noise: float) -> None:
     """Expected small, they would be taken for a turn; it shows only when the model's error is told from noise."""
     model, plain = Biased(body), registrar(body)
-    options = RegistrationOptions(gathering=gathering_for(model, has_zone=True, has_pose=True))
+    options = options_for(model, has_zone=True, has_pose=True)
     pose = PosePrior(Pose.identity(), body.points.mean(axis=0))
     cloud = cloud_on(body, true_displacement(body, np.array([0.5, -0.5])), 400, rng, noise)
     spreads = []

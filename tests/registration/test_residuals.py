@@ -9,6 +9,7 @@ import pytest
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.closest import ClosestPoints, closest_in_triangles
+from softtwin.meshes.shapes import beam
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.pose import Pose
@@ -54,6 +55,38 @@ def test_all_coefficients_pass_the_taylor_test(body: Body, observed: SurfaceDist
     assert np.median(np.log2(np.divide(errors[:-1], errors[1:]))) > 1.9
     cotangent = rng.standard_normal(len(cloud))
     np.testing.assert_allclose(problem.pulled(start, cotangent), cotangent @ problem.jacobian(start), rtol=1e-9)
+
+
+def _ball(radius: float = 0.05) -> Body:
+    """A ball of hexahedra: a cube whose shells are blown up to spheres."""
+    cube = beam((10, 10, 10), (2.0, 2.0, 2.0), "hexahedron")
+    place = cube.points - 1.0
+    around = np.abs(place).max(axis=1) / np.maximum(np.linalg.norm(place, axis=1), 1e-300)
+    made = Body(radius * place * around[:, None], cube.cells, cube.node_sets)
+    return Body(made.points, made.cells, made.node_sets, {"observed": made.boundary})
+
+
+@pytest.mark.parametrize("noise", [3e-3, 8e-3])
+def test_noisy_points_of_a_round_body_are_expected_outside(noise: float, rng) -> None:
+    """Of a sphere of radius r by sigma^2 / r in the mean: were they not, noise would blow the body up."""
+    ball = _ball()
+    observed, rest = SurfaceDistance(ball), np.zeros_like(ball.points)
+    cloud = cloud_on(ball, rest, 20_000, rng, noise=noise)
+    match = observed.match(rest[observed.nodes], cloud)
+    mean, doubt = float(match.distances.mean()), noise / np.sqrt(len(cloud))
+    assert mean < -5.0 * doubt
+    expected = observed.expected(match, noise)
+    assert float(expected.mean()) == pytest.approx(mean, abs=3.0 * doubt)
+    assert float(expected.mean()) == pytest.approx(-(noise**2) / 0.05, rel=0.15)
+
+
+def test_a_tip_is_expected_no_further_off_than_a_point(rng) -> None:
+    """Points about a single point with noise of all directions lie sigma sqrt(8 / pi) from it in the mean."""
+    ball = _ball(radius=1e-6)
+    observed, rest = SurfaceDistance(ball), np.zeros_like(ball.points)
+    cloud = 1e-3 * rng.standard_normal((4000, 3))
+    match = observed.match(rest[observed.nodes], cloud)
+    assert float(observed.expected(match, 1e-3).mean()) == pytest.approx(match.distances.mean(), rel=0.05)
 
 
 def test_closest_points_are_the_closest(body: Body, observed: SurfaceDistance, rng) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body
-from softtwin.registration.evidence import Scale, find_scales, linearised
+from softtwin.registration.evidence import Scale, Scales, find_scales, linearised
 from softtwin.registration.loss import Huber, Loss, Square, Tukey, robust_deviation
-from softtwin.registration.posterior import posterior
+from softtwin.registration.posterior import Posterior, posterior
 from softtwin.registration.registrar import Prepared
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import Forces, Informed, contact, nodal_forces, windowed
@@ -91,9 +91,25 @@ def test_what_is_left_out_keeps_its_variance(body: Body) -> None:
 
 
 def test_without_data_the_posterior_is_the_prior() -> None:
-    found = posterior(np.zeros((3, 3)), np.array([4.0, 4.0, 1.0]), np.zeros(3), _scales())
+    found = posterior(np.zeros((3, 3)), np.array([4.0, 4.0, 1.0]), np.zeros(3), _scales(), 2)
     np.testing.assert_allclose(found.covariance, np.diag([0.25, 0.25, 1.0]))
     assert found.informed == 0.0
+
+
+def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(rng) -> None:
+    """As far as the mean moves with the scale, by differences, beside the covariance at that scale."""
+    jacobian, data, spread = rng.standard_normal((20, 3)), rng.standard_normal(20), 0.3
+
+    def found(scale: float) -> Posterior:
+        precision = np.array([scale**-2, scale**-2, 1.0])
+        inverse = np.linalg.inv(jacobian.T @ jacobian + np.diag(precision))
+        scales = Scales(1.0, scale, (0.0, spread))
+        return posterior(jacobian.T @ jacobian, precision, inverse @ (jacobian.T @ data), scales, 2)
+
+    here, step = found(0.3), 1e-4
+    slope = (found(0.3 * np.exp(step)).mean - found(0.3 * np.exp(-step)).mean) / (2.0 * step)
+    alone = np.linalg.inv(jacobian.T @ jacobian + np.diag([0.3**-2, 0.3**-2, 1.0]))
+    np.testing.assert_allclose(here.covariance, alone + spread**2 * np.outer(slope, slope), rtol=1e-5)
 
 
 def _scales():
