@@ -21,7 +21,7 @@ from softtwin.app.launch import generate_in_parallel
 from softtwin.app.stages.learn import train_stage, validate_stage
 from softtwin.app.workspace import Workspace
 from softtwin.meshes.files import write_body
-from softtwin.registration.registrar import RegistrationOptions
+from softtwin.registration.registrar import options_for
 
 RUNS = Path(__file__).parent / "runs"
 
@@ -71,10 +71,9 @@ def main() -> None:
     model = load(twin, body)
     figures = {"smoothness": arguments.smoothness, "sequences": {}}
     figures["held_out"] = model.card.get("held_out")
-    options = RegistrationOptions()
     with threadpool_limits(1):
         for name in SEQUENCES:
-            rows = run(sequence(name), model, arguments.frames, options, arguments.smoothness)
+            rows = run(sequence(name), model, arguments.frames, options_for(model, has_zone=True), arguments.smoothness)
             figures["sequences"][name] = {"summary": summary(rows), "frames": rows}
             print(name, {key: round(value, 4) for key, value in summary(rows).items()}, flush=True)
     write("registration_surrogate", figures)
