@@ -19,7 +19,6 @@ from .problem import Problem, Trial
 
 Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
-_EXACTLY = 0.25
 _KEPT = 0.2  # a whole step that misses its promise by less: where only a start is wanted, it was the last
 _TRUSTED = 3.0  # deviations
 _UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
@@ -111,9 +110,13 @@ class GaussNewton:
         few = min(self.max_iterations, _ROUGH)
         return replace(self, losses=self.losses[:1], settled=self.handed_on, max_iterations=few)
 
-    def exactly(self) -> GaussNewton:
-        """The same, ended later: one step of many may be short and lie in a direction that the cloud tells well."""
-        return replace(self, settled=_EXACTLY * self.settled)
+    def settling(self, part: float) -> GaussNewton:
+        """The same, ended by steps of this part of the length: the last of many may be short and leave far to go.
+
+        Args:
+            part: of what is settled.
+        """
+        return replace(self, settled=part * self.settled)
 
     def last(self) -> GaussNewton:
         """The same with the last loss alone: from where all have been."""

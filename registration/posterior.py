@@ -51,6 +51,6 @@ def posterior(information: Floats, precision: Floats, mean: Floats, scales: Scal
     """
     covariance = np.linalg.inv(information + np.diag(precision))
     by_scale = 2.0 * covariance[:, :forces] @ (precision * mean)[:forces]  # of the mean, by the logarithm of the scale
-    moved = scales.spread[1] * by_scale
+    moved: Floats = scales.spread[1] * by_scale
     informed = float(np.einsum("ij,ji->", covariance, information))
-    return Posterior(mean, covariance + np.outer(moved, moved), scales, informed)
+    return Posterior(mean, covariance + moved[:, None] * moved, scales, informed)

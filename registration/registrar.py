@@ -31,7 +31,9 @@ from .verdict import Expectations, Judgement, Verdict, judge
 Floats = NDArray[np.float64]
 # Of the logarithm of a nodal force: with more, forces explain noise and the model's error. Without either, a pull at a
 # few nodes makes it many times what was expected.
-_SPREAD, _CLEAR_SPREAD = 0.5, 1.0
+_SPREAD = 0.5
+_SPREAD_ANYWHERE = 0.7  # where a cloud tells the size of forces of which most are none
+_THOROUGH = 0.25
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
@@ -40,7 +42,7 @@ _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its sa
 _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
 _MANY = 10_000  # points: of no cloud that is left after thinning are there more
-_CLEAR = 2.0  # times the least noise
+_CLEAR, _LOUD = 2.0, 1.5  # times the least noise, times the model's error
 _CLOSE = 0.01  # reach of a surrogate's forces whose zone is unknown: with more, their doubt is larger than their error
 _LEADING = 6  # directions of force that a cold start begins with
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
@@ -53,6 +55,8 @@ class Gathering:
     Args:
         rounds: how often.
         clear: clouds of less noise tell the size of the forces, whatever was expected of it, metres.
+        loud: and so do clouds of more noise, beside which what the model gets wrong is small, metres.
+        spread: of the logarithm of the forces' size where the cloud tells it.
         reach: forces within this part of the body's size are gathered together.
         informed: which directions are kept of gathered forces.
         points: so many of the cloud are enough, but for the last round.
@@ -60,6 +64,8 @@ class Gathering:
 
     rounds: int = 2
     clear: float = 0.0
+    loud: float = np.inf
+    spread: float = 1.0
     reach: float = 0.035
     informed: Informed = field(default_factory=Informed)
     points: int = 300
@@ -78,12 +84,14 @@ class RegistrationOptions:
         solver: how the objective is minimised.
         most_points: larger clouds are thinned to so many points.
         gathering: how a cold start finds where forces act.
+        thorough: part of what the solver calls settled that a cold start has to reach.
     """
 
     noise: Scale = NOISE
     solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
     most_points: int = 1000
     gathering: Gathering = field(default_factory=Gathering)
+    thorough: float = 1.0
 
     def __post_init__(self) -> None:
         if self.most_points < 1:
@@ -216,6 +224,7 @@ class Registrar:
         self.noise = self.options.noise.at_least(model.error)
         self.expectations = expectations or Expectations.of(model, self.noise)
         self._everywhere = Prepared.of(model, observed, forces)
+        self._thorough = self.options.solver.settling(self.options.thorough)
 
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud.
@@ -235,7 +244,7 @@ class Registrar:
         problem = self._problem(points, start.prepared, start.trial, start.doubt)
         near = problem.begun(start.trial.coefficients.copy(), start.trial)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
-            found = self._from_rest(points, start.prepared, self.options.solver)
+            found = self._from_rest(points, start.prepared, self._thorough)
             result = self._finished(points, start.prepared, found, begin)
         else:
             solver = self.options.solver.following()
@@ -283,7 +292,7 @@ class Registrar:
 
     def _cold(self, points: Floats, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more for each round of gathering them."""
-        prepared, gathering, solver = self._everywhere, self.options.gathering, self.options.solver
+        prepared, gathering, solver = self._everywhere, self.options.gathering, self._thorough
         few, is_gathered = _thinned(points, gathering.points), gathering.rounds > 0
         begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
         found = self._from_rest(*begun)
@@ -310,10 +319,10 @@ class Registrar:
         self, points: Floats, prepared: Prepared, found: Found, begin: float, is_settled: bool = True
     ) -> Registration:
         """With all points, and with the model's error in patterns, from a result that took it for noise."""
-        solver, doubt, is_hopeless = self.options.solver, 1.0, self._is_hopeless(found)
+        solver, doubt, is_hopeless = self._thorough, 1.0, self._is_hopeless(found)
         if is_hopeless:
             solver = solver.without_steps()
-        believed = self._believed(prepared, found)
+        believed = prepared if self.error is not None else self._believed(prepared, found)
         problem = self._problem(points, believed, found.trial)
         is_settled = is_settled and believed is prepared and len(found.trial.cloud) == len(points)
         if self.error is not None or not is_settled:
@@ -321,7 +330,7 @@ class Registrar:
             start = np.concatenate([found.trial.coefficients, errors])
             found = _after(found, solver.solve(problem, start, found.trial))
         wider = self._believed(believed, found)
-        if wider is not believed:  # clear only now that the model's error is told from noise
+        if wider is not believed:  # seen only now that the model's error is told from noise
             believed, problem = wider, replace(problem, forces=wider.forces)
             found = _after(found, solver.solve(problem, found.trial.coefficients, found.trial))
         if self.error is not None and not is_hopeless:
@@ -329,11 +338,12 @@ class Registrar:
         return self._result(problem, found, believed, begin, doubt)
 
     def _believed(self, prepared: Prepared, found: Found) -> Prepared:
-        """The forces' size as the cloud tells it, where it is clear: what was expected would call a pull outliers."""
-        is_clear = found.posterior.scales.noise < self.options.gathering.clear
-        if not is_clear or prepared.forces.scale.spread >= _CLEAR_SPREAD:
+        """The forces' size as the cloud tells it, where it can: what was expected would call a sharp pull outliers."""
+        gathering, noise = self.options.gathering, found.posterior.scales.noise
+        is_told = noise < gathering.clear or noise > gathering.loud
+        if not is_told or prepared.forces.scale.spread >= gathering.spread:
             return prepared
-        return prepared.believing(_CLEAR_SPREAD)
+        return prepared.believing(gathering.spread)
 
     def _is_hopeless(self, found: Found) -> bool:
         return found.posterior.scales.noise > _HOPELESS * self.expectations.noise
@@ -460,24 +470,23 @@ def prepare(
 def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> RegistrationOptions:
     """Options that suit a model.
 
-    Within a zone forces are not gathered: what a cloud was used to believe it would be used to find once more. An exact
-    model is only as good as the end of the descent. What a surrogate gets wrong could be taken for large forces, so a
-    clear cloud is not left to tell their size; but where the pose is unknown, forces that are expected small would be
-    taken for a turn of the organ, which is worse.
+    An exact model is only as good as the end of the descent; within a zone its forces are not gathered, since what a
+    cloud was used to believe it would be used to find once more. What a surrogate gets wrong could be taken for large
+    forces: it is left to clouds of more noise than that to tell their size. But where the pose is unknown, forces that
+    are expected small would be taken for a turn of the organ, which is worse.
 
     Args:
         model: forward model.
         has_zone: the nodes that may carry force are those that a tool can touch.
         has_pose: the pose is unknown.
     """
-    clear, is_exact = _CLEAR * NOISE.least, model.error == 0.0
-    if is_exact:
-        gathering = Gathering(clear=clear, points=_MANY)
-    else:
-        gathering = Gathering(clear=clear if has_zone and has_pose else 0.0, reach=_CLOSE)
+    clear, loud = _CLEAR * NOISE.least, _LOUD * model.error
+    if model.error == 0.0:
+        rounds = 0 if has_zone else Gathering.rounds
+        return RegistrationOptions(gathering=Gathering(rounds, clear=clear, points=_MANY), thorough=_THOROUGH)
     if has_zone:
-        gathering = replace(gathering, rounds=0)
-    return RegistrationOptions(solver=GaussNewton().exactly() if is_exact else GaussNewton(), gathering=gathering)
+        return RegistrationOptions(gathering=Gathering(clear=clear if has_pose else 0.0, loud=loud))
+    return RegistrationOptions(gathering=Gathering(loud=loud, spread=_SPREAD_ANYWHERE, reach=_CLOSE))
 
 
 def expected_force(body: Body, young_modulus: float) -> float:
