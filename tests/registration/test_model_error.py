@@ -106,6 +106,16 @@ def test_a_clear_cloud_of_an_unknown_pose_tells_the_size_of_forces(body: Body, r
     assert (spreads[0] > spreads[1]) == (noise == 0.0)
 
 
+@pytest.mark.parametrize("noise", [1e-3, 2e-2])
+def test_noise_beside_which_the_models_error_is_small_tells_the_size_of_forces(body: Body, rng, noise: float) -> None:
+    """Less noise than the model's error does not: the error would be taken for forces."""
+    model, plain = Biased(body), registrar(body)
+    made = Registrar(model, plain.observed, plain.forces, options_for(model, has_zone=True))
+    result = made.register(cloud_on(body, true_displacement(body, np.array([0.5, -0.5])), 400, rng, noise))
+    assert result.judgement.is_usable
+    assert (result.prepared.forces.scale.spread > plain.forces.scale.spread) == (noise > model.error)
+
+
 def test_the_next_frame_starts_from_the_error_found(body: Body, rng) -> None:
     truth = true_displacement(body, np.array([1.0, -1.0]))
     made = registrar(body)

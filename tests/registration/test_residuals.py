@@ -12,6 +12,8 @@ from softtwin.meshes.closest import ClosestPoints, closest_in_triangles
 from softtwin.meshes.shapes import beam
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
+from softtwin.registration.gauss_newton import LocalModel
+from softtwin.registration.loss import Huber
 from softtwin.registration.pose import Pose
 from softtwin.registration.problem import Problem
 from softtwin.registration.residuals import SurfaceDistance
@@ -87,6 +89,18 @@ def test_a_tip_is_expected_no_further_off_than_a_point(rng) -> None:
     cloud = 1e-3 * rng.standard_normal((4000, 3))
     match = observed.match(rest[observed.nodes], cloud)
     assert float(observed.expected(match, 1e-3).mean()) == pytest.approx(match.distances.mean(), rel=0.05)
+
+
+def test_what_is_yet_to_be_explained_is_no_noise_of_the_points(body: Body, observed: SurfaceDistance, rng) -> None:
+    """At rest a moved surface looks like noise; as much of it would put every round place where it is not."""
+    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 1.0))
+    cantilever = Cantilever(body)
+    model = reduce_model(cantilever, observed.nodes, forces.basis)
+    cloud = cloud_on(body, cantilever.solve(tip_forces(body, (0.0, 0.4, 0.8))).displacement, 200, rng, noise=1e-3)
+    problem = Problem(model, observed, forces, None, cloud, Scale(1e-3, 1.5))
+    rest = problem.trial(np.zeros(forces.size))
+    local = LocalModel(problem, rest, Huber(), rest.match.rms, graduation=1.0)
+    assert local.is_graduated and local.own < 0.5 * local.noise
 
 
 def test_closest_points_are_the_closest(body: Body, observed: SurfaceDistance, rng) -> None:
