@@ -13,10 +13,9 @@ from scipy.spatial import cKDTree
 
 from .body import Body, Floats, Ints, Surface
 from .closest import closest_points
-from .elements import split_facets
+from .elements import linear_kind, split_facets
+from .quadrature import shape_functions
 
-# Corners of the reference cube in VTK order.
-_CUBE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], dtype=float)
 _NEWTON_STEPS = 20
 _STEP_TOLERANCE = 1e-13
 _TOLERANCE = 1e-9  # in local coordinates: how far outside a cell a point still counts as inside
@@ -86,12 +85,7 @@ def embed(body: Body, points: ArrayLike) -> Embedding:
         cells[lost], positions[lost], outside[lost] = _nearest(body, positions[lost])
     if not body.is_straight:
         raise ValueError("body: expected straight cells, got curved ones; points are found in linear cells alone.")
-    if body.is_tetrahedral:
-        weights = _tetrahedron_weights(body, cells, positions)
-    else:
-        weights = _trilinear(_local_coordinates(body, cells, positions))
-    if body.kind.degree == 2:
-        weights = _quadratic(body, weights)
+    weights = shape_functions(body.kind, _local_coordinates(body, cells, positions))[0]
     return Embedding(cells, body.cells[cells], weights, outside, len(body.points))
 
 
@@ -142,10 +136,9 @@ def _candidates(body: Body, points: Floats) -> tuple[Ints, Ints]:
 
 def _depths(body: Body, cells: Ints, points: Floats) -> Floats:
     """Smallest local coordinate of each point in its cell: not negative inside."""
-    if body.is_tetrahedral:
-        return _tetrahedron_weights(body, cells, points).min(axis=1)
     xi = _local_coordinates(body, cells, points)
-    return np.minimum(xi, 1 - xi).min(axis=1)
+    across = 1 - xi.sum(axis=1, keepdims=True) if body.is_tetrahedral else 1 - xi
+    return np.minimum(xi, across).min(axis=1)
 
 
 def _nearest(body: Body, points: Floats) -> tuple[Ints, Floats, Floats]:
@@ -164,46 +157,20 @@ def _owners(body: Body) -> Ints:
     return np.array([known[tuple(corners)] for corners in body.boundary.tolist()])
 
 
-def _quadratic(body: Body, weights: Floats) -> Floats:
-    """Weights of all nodes of a straight quadratic cell from the linear weights of its corners."""
-    kind = body.kind
-    if body.is_tetrahedral:
-        first, second = np.array(kind.parents).T
-        return np.column_stack([weights * (2 * weights - 1), 4 * weights[:, first] * weights[:, second]])
-    xi = weights @ _CUBE
-    nodes = np.array([*_CUBE, *(_CUBE[list(group)].mean(axis=0) for group in kind.parents)])
-    # Along each axis the nodes are at 0, 1/2 and 1.
-    basis = np.stack([(1 - xi) * (1 - 2 * xi), 4 * xi * (1 - xi), xi * (2 * xi - 1)], axis=2)
-    return np.prod([basis[:, axis, np.rint(2 * nodes[:, axis]).astype(int)] for axis in range(3)], axis=0)
-
-
-def _tetrahedron_weights(body: Body, cells: Ints, points: Floats) -> Floats:
-    corners = body.points[body.corner_cells[cells]]
-    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    last = np.linalg.solve(edges, (points - corners[:, 0])[:, :, None])[:, :, 0]
-    return np.column_stack([1 - last.sum(axis=1), last])
-
-
 def _local_coordinates(body: Body, cells: Ints, points: Floats) -> Floats:
-    """Coordinates in the reference cube, (p, 3), by Newton's method on the trilinear map."""
-    corners = body.points[body.corner_cells[cells]]
+    """Coordinates in the reference cell, (p, 3), of straight cells; in cubes by Newton's method on the trilinear map."""
+    kind, corners = linear_kind(body.kind), body.points[body.corner_cells[cells]]
+    if body.is_tetrahedral:
+        edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+        found: Floats = np.linalg.solve(edges, (points - corners[:, 0])[:, :, None])[:, :, 0]
+        return found
     xi = np.full((len(points), 3), 0.5)
     for _ in range(_NEWTON_STEPS):
-        gap = points - np.einsum("pk,pki->pi", _trilinear(xi), corners)
-        jacobian = np.einsum("pki,pkj->pij", corners, _trilinear_gradient(xi))
+        values, slopes = shape_functions(kind, xi)
+        gap = points - np.einsum("pk,pki->pi", values, corners)
+        jacobian = np.einsum("pki,pkj->pij", corners, slopes)
         step = np.linalg.solve(jacobian, gap[:, :, None])[:, :, 0]
         xi = np.clip(xi + step, -0.25, 1.25)  # farther out the map may fold over
         if np.abs(step).max(initial=0.0) < _STEP_TOLERANCE:
             break
     return xi
-
-
-def _trilinear(xi: Floats) -> Floats:
-    return np.prod(np.where(_CUBE > 0, xi[:, None, :], 1 - xi[:, None, :]), axis=2)
-
-
-def _trilinear_gradient(xi: Floats) -> Floats:
-    factors = np.where(_CUBE > 0, xi[:, None, :], 1 - xi[:, None, :])
-    signs = 2 * _CUBE - 1
-    x, y, z = (factors[:, :, i] for i in range(3))
-    return np.stack([signs[:, 0] * y * z, signs[:, 1] * x * z, signs[:, 2] * x * y], axis=2)
