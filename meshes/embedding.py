@@ -158,7 +158,7 @@ def _owners(body: Body) -> Ints:
 
 
 def _local_coordinates(body: Body, cells: Ints, points: Floats) -> Floats:
-    """Coordinates in the reference cell, (p, 3), of straight cells; in cubes by Newton's method on the trilinear map."""
+    """Coordinates in the reference cell, (p, 3), of straight cells; in cubes by Newton's method on its map."""
     kind, corners = linear_kind(body.kind), body.points[body.corner_cells[cells]]
     if body.is_tetrahedral:
         edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)

@@ -14,48 +14,7 @@ from softtwin.meshes.elements import linear_kind
 from softtwin.meshes.quadrature import quadrature, quadrature_degree, shape_functions
 from softtwin.reference.materials import Energy, Material
 
-
-class TorchAlgebra:
-    """The tensor functions that energies are written in (`materials.Algebra`), on the last two axes of a batch.
-
-    Args:
-        like: a tensor of the precision and on the device wanted.
-    """
-
-    def __init__(self, like: Tensor) -> None:
-        self.like = like
-
-    def Identity(self, size: int) -> Tensor:  # noqa: N802 - UFL's name
-        """The unit tensor."""
-        return torch.eye(size, dtype=self.like.dtype, device=self.like.device)
-
-    def transpose(self, A: Tensor) -> Tensor:
-        """A^T."""
-        return A.mT
-
-    def dot(self, A: Tensor, B: Tensor) -> Tensor:
-        """The product A B."""
-        return A @ B
-
-    def sym(self, A: Tensor) -> Tensor:
-        """(A + A^T) / 2."""
-        return 0.5 * (A + A.mT)
-
-    def tr(self, A: Tensor) -> Tensor:
-        """The trace."""
-        return A.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
-
-    def det(self, A: Tensor) -> Tensor:
-        """The determinant of 3 x 3."""
-        return (A[..., 0, :] * torch.linalg.cross(A[..., 1, :], A[..., 2, :])).sum(dim=-1)
-
-    def inner(self, A: Tensor, B: Tensor) -> Tensor:
-        """A : B."""
-        return (A * B).sum(dim=(-2, -1))
-
-    def ln(self, a: Tensor) -> Tensor:
-        """The natural logarithm; NaN where a cell is inside out."""
-        return a.log()
+from .algebra import TorchAlgebra
 
 
 class ElasticBody(nn.Module):
