@@ -1,0 +1,71 @@
+"""What isotropic noise does to the distances of a cloud from a round surface, and by it to the forces.
+
+    python benchmarks/noise_bias.py [--draws 20]
+
+At the truth of frames 0, 2, ... 8 of s1, s2, s3 of the public liver: the mean signed distance of noisy clouds, and the
+mean step of the net force that the linear response then asks for, along the true force and in its deviations (Tukey's
+weights; coefficients expected at 0.05 N, as clear clouds find them). Without and with what `SurfaceDistance.expected`
+takes off: nothing is found there that the true state has not, so a mean other than 0 is bias.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+from liver import SEQUENCES, sequence
+from record import write
+from robustness import forward_model, noisy, registrar_for
+from threadpoolctl import threadpool_limits
+
+from softtwin.registration.loss import Tukey
+
+EXPECTED_N = 0.05
+NOISES_MM = (1.0, 2.0, 5.0)
+
+
+def measure(name: str, draws: int) -> list[dict[str, float]]:
+    """One entry for each noise and each kind of residual of a sequence."""
+    data = sequence(name)
+    rows: dict[tuple[float, bool], list[tuple[float, float]]] = {
+        (mm, taken): [] for mm in NOISES_MM for taken in (False, True)
+    }
+    with forward_model("reference", None) as model:
+        registrar = registrar_for(model, data.zone, True)
+        observed, net = registrar.observed, registrar.forces.net_basis
+        for frame in range(0, 10, 2):
+            state = registrar.register(data.clouds[frame]).trial.state
+            truth = (data.positions[frame] - model.body.points)[observed.nodes]
+            along = data.net_forces[frame] / np.linalg.norm(data.net_forces[frame])
+            for mm, taken in rows:
+                for draw in range(draws):
+                    cloud = noisy(mm)(data.clouds[frame], model.body, np.random.default_rng([draw, frame, int(mm)]))
+                    match = observed.match(truth, cloud)
+                    residuals = match.distances - (observed.expected(match, 1e-3 * mm) if taken else 0.0)
+                    jacobian = state.jacobian(observed.rows(match)) / (1e-3 * mm)
+                    weighted = Tukey().weight(residuals / (1e-3 * mm))[:, None] * jacobian
+                    covariance = np.linalg.inv(weighted.T @ jacobian + np.eye(jacobian.shape[1]) / EXPECTED_N**2)
+                    step = -net @ covariance @ (weighted.T @ residuals) / (1e-3 * mm)
+                    deviation = float(np.sqrt(along @ net @ covariance @ net.T @ along))
+                    rows[mm, taken].append((1e3 * residuals.mean(), float(step @ along) / deviation))
+    return [
+        {"noise_mm": mm, "is_taken_off": taken, "mean_residual_mm": found[0], "mean_step_deviations": found[1]}
+        for (mm, taken), found in ((key, np.mean(value, axis=0).tolist()) for key, value in rows.items())
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=20)
+    arguments = parser.parse_args()
+    figures = {}
+    with threadpool_limits(1):
+        for name in SEQUENCES:
+            figures[name] = measure(name, arguments.draws)
+            for row in figures[name]:
+                print(name, {key: round(value, 3) for key, value in row.items()}, flush=True)
+    write("noise_bias", {"draws": arguments.draws, "sequences": figures})
+
+
+if __name__ == "__main__":
+    main()
