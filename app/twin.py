@@ -347,7 +347,7 @@ def _options(section: RegistrationSection, suited: RegistrationOptions) -> Regis
     gathering = suited.gathering
     if section.rounds >= 0:
         gathering = replace(gathering, rounds=section.rounds)
-    return RegistrationOptions(noise, solver, section.points, gathering, suited.thorough)
+    return replace(suited, noise=noise, solver=solver, most_points=section.points, gathering=gathering)
 
 
 def with_options(config: Config, options: dict[str, Any]) -> Config:

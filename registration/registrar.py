@@ -33,7 +33,7 @@ Floats = NDArray[np.float64]
 # few nodes makes it many times what was expected.
 _SPREAD = 0.5
 _SPREAD_ANYWHERE = 0.7  # where a cloud tells the size of forces of which most are none
-_THOROUGH = 0.25
+_THOROUGH = 0.25  # with less, what is left of an exact model's descent is a part of its doubt
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
@@ -54,18 +54,12 @@ class Gathering:
 
     Args:
         rounds: how often.
-        clear: clouds of less noise tell the size of the forces, whatever was expected of it, metres.
-        loud: and so do clouds of more noise, beside which what the model gets wrong is small, metres.
-        spread: of the logarithm of the forces' size where the cloud tells it.
         reach: forces within this part of the body's size are gathered together.
         informed: which directions are kept of gathered forces.
         points: so many of the cloud are enough, but for the last round.
     """
 
     rounds: int = 2
-    clear: float = 0.0
-    loud: float = np.inf
-    spread: float = 1.0
     reach: float = 0.035
     informed: Informed = field(default_factory=Informed)
     points: int = 300
@@ -73,6 +67,21 @@ class Gathering:
     def __post_init__(self) -> None:
         if self.points < 1:
             raise ValueError(f"Gathering.points: expected at least 1, got {self.points}.")
+
+
+@dataclass(frozen=True)
+class Belief:
+    """When the size of the forces is left to the cloud, whatever was expected of it.
+
+    Args:
+        clear: in clouds of less noise, metres.
+        loud: and in clouds of more, beside which what the model gets wrong is small, metres.
+        spread: of the logarithm of the size then.
+    """
+
+    clear: float = 0.0
+    loud: float = np.inf
+    spread: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -84,6 +93,7 @@ class RegistrationOptions:
         solver: how the objective is minimised.
         most_points: larger clouds are thinned to so many points.
         gathering: how a cold start finds where forces act.
+        belief: when the size of the forces is left to the cloud.
         thorough: part of what the solver calls settled that a cold start has to reach.
     """
 
@@ -91,11 +101,14 @@ class RegistrationOptions:
     solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
     most_points: int = 1000
     gathering: Gathering = field(default_factory=Gathering)
+    belief: Belief = field(default_factory=Belief)
     thorough: float = 1.0
 
     def __post_init__(self) -> None:
         if self.most_points < 1:
             raise ValueError(f"RegistrationOptions.most_points: expected at least 1, got {self.most_points}.")
+        if not 0.0 < self.thorough <= 1.0:
+            raise ValueError(f"RegistrationOptions.thorough: expected a part above 0 and up to 1, got {self.thorough}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,11 +352,11 @@ class Registrar:
 
     def _believed(self, prepared: Prepared, found: Found) -> Prepared:
         """The forces' size as the cloud tells it, where it can: what was expected would call a sharp pull outliers."""
-        gathering, noise = self.options.gathering, found.posterior.scales.noise
-        is_told = noise < gathering.clear or noise > gathering.loud
-        if not is_told or prepared.forces.scale.spread >= gathering.spread:
+        belief, noise = self.options.belief, found.posterior.scales.noise
+        is_told = noise < belief.clear or noise > belief.loud
+        if not is_told or prepared.forces.scale.spread >= belief.spread:
             return prepared
-        return prepared.believing(gathering.spread)
+        return prepared.believing(belief.spread)
 
     def _is_hopeless(self, found: Found) -> bool:
         return found.posterior.scales.noise > _HOPELESS * self.expectations.noise
@@ -482,11 +495,11 @@ def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> 
     """
     clear, loud = _CLEAR * NOISE.least, _LOUD * model.error
     if model.error == 0.0:
-        rounds = 0 if has_zone else Gathering.rounds
-        return RegistrationOptions(gathering=Gathering(rounds, clear=clear, points=_MANY), thorough=_THOROUGH)
+        gathering = Gathering(rounds=0 if has_zone else Gathering.rounds, points=_MANY)
+        return RegistrationOptions(gathering=gathering, belief=Belief(clear), thorough=_THOROUGH)
     if has_zone:
-        return RegistrationOptions(gathering=Gathering(clear=clear if has_pose else 0.0, loud=loud))
-    return RegistrationOptions(gathering=Gathering(loud=loud, spread=_SPREAD_ANYWHERE, reach=_CLOSE))
+        return RegistrationOptions(belief=Belief(clear if has_pose else 0.0, loud))
+    return RegistrationOptions(gathering=Gathering(reach=_CLOSE), belief=Belief(loud=loud, spread=_SPREAD_ANYWHERE))
 
 
 def expected_force(body: Body, young_modulus: float) -> float:
