@@ -48,6 +48,17 @@ def noisy(millimetres: float) -> Callable[[Floats, Body, Generator], Floats]:
     return lambda cloud, body, rng: cloud + 1e-3 * millimetres * rng.standard_normal(cloud.shape)
 
 
+def along_the_view(millimetres: float) -> Callable[[Floats, Body, Generator], Floats]:
+    """Noise of depth alone, as a camera that looks straight at the observed side has it."""
+
+    def moved(cloud: Floats, body: Body, rng: Generator) -> Floats:
+        corners = body.points[body.surfaces["observed"]]
+        view = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+        return cloud + 1e-3 * millimetres * rng.standard_normal((len(cloud), 1)) * view / np.linalg.norm(view)
+
+    return moved
+
+
 def clean(cloud: Floats, body: Body, rng: Generator) -> Floats:
     return cloud
 
@@ -78,6 +89,8 @@ ROWS: dict[str, tuple[Callable[[Floats, Body, Generator], Floats], bool, bool]] 
     "noise 1 mm": (noisy(1.0), True, False),
     "noise 2 mm": (noisy(2.0), True, False),
     "noise 5 mm": (noisy(5.0), True, False),
+    "noise 2 mm along the view": (along_the_view(2.0), True, False),
+    "noise 5 mm along the view": (along_the_view(5.0), True, False),
     "outliers": (with_outliers, True, False),
     "half of the points": (part(0.5), True, False),
     "quarter of the points": (part(0.25), True, False),

@@ -17,6 +17,8 @@ ASKED = {
     "noise 1 mm": "0.3; 6; 0.8-1.3",
     "noise 2 mm": "0.4; 9; 0.8-1.3",
     "noise 5 mm": "0.7; 15; 0.8-1.3",
+    "noise 2 mm along the view": "-",
+    "noise 5 mm along the view": "-",
     "outliers": "0.1 / 0.3; -; <= 1.5",
     "pose off by 2 degrees and 3 mm": "0.5; -; <= 1.5",
     "no zone, clean": "0.6",
