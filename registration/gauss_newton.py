@@ -81,6 +81,8 @@ class GaussNewton:
         losses: one after the other.
         max_iterations: of all losses together.
         settled: a step shorter than this, in posterior deviations a coefficient, is not taken: it has converged.
+        enough: where no step lowers the objective further, or iterations run out, a step shorter than this counts as
+            settled: closest points jump from triangle to triangle, and no objective falls for ever.
         handed_on: the same for all losses but the last.
         graduation: the noise is taken as at least this part of what the linear model promises to change.
         max_step: first limit on the movement of any observed node in one step, metres.
@@ -92,6 +94,7 @@ class GaussNewton:
     losses: tuple[Loss, ...] = (Huber(), Tukey())
     max_iterations: int = 40
     settled: float = 0.2
+    enough: float = 0.2
     handed_on: float = 1.0
     graduation: float = 1.0
     max_step: float = 16e-3
@@ -101,7 +104,7 @@ class GaussNewton:
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
             raise ValueError(f"GaussNewton.max_iterations: expected at least 1, got {self.max_iterations}.")
-        for name in ("settled", "handed_on", "max_step", "least_step"):
+        for name in ("settled", "enough", "handed_on", "max_step", "least_step"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"GaussNewton.{name}: expected a positive number, got {getattr(self, name)}.")
 
@@ -164,6 +167,8 @@ class _Search:
         for loss in options.losses[:-1]:
             self._descend(loss, options.handed_on)
         outcome = self._descend(options.losses[-1], options.settled)
+        if outcome in (Outcome.NO_DESCENT, Outcome.MOST_ITERATIONS) and self._has_enough():
+            outcome = Outcome.CONVERGED
         local = self._local(self.options.losses[-1])
         return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
 
@@ -192,6 +197,10 @@ class _Search:
             if is_handed_on and local.was_whole and abs(self.trace[-1].gain - 1.0) < _KEPT:
                 return Outcome.CONVERGED
         return Outcome.MOST_ITERATIONS
+
+    def _has_enough(self) -> bool:
+        local, enough = self._local(self.options.losses[-1]), self.options.enough
+        return local.length < enough and not local.is_graduated and self._is_closest(local, enough)
 
     def _is_closest(self, local: LocalModel, settled: float) -> bool:
         """Search the closest points anew; True where that moves the minimum no further than the search goes."""

@@ -92,6 +92,16 @@ def test_a_step_that_is_cut_is_no_convergence(body: Body, rng) -> None:
     assert any("not converged" in reason for reason in cut.judgement.reasons)
 
 
+def test_the_end_of_the_descent_is_convergence(body: Body, rng) -> None:
+    """Closest points jump from triangle to triangle: no step gets below what is asked here, and none is needed."""
+    truth = Cantilever(body).solve(tip_forces(body, NET)).displacement
+    cloud = cloud_on(body, truth, 200, rng, noise=2e-3)
+    far = register(body, cloud, GaussNewton(settled=1e-12))
+    near = register(body, cloud)
+    assert far.outcome is Outcome.CONVERGED and near.outcome is Outcome.CONVERGED
+    assert far.rms_distance == pytest.approx(near.rms_distance, rel=0.02)
+
+
 def test_a_model_that_refuses_ends_refused_and_says_so(body: Body, rng) -> None:
     truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.0, -1.5))).displacement
     observed = SurfaceDistance(body, body.surfaces["observed"])
@@ -176,7 +186,7 @@ def test_large_clouds_are_thinned_and_answer_alike(body: Body, rng) -> None:
     assert large.noise == pytest.approx(1e-3, rel=0.15)
 
 
-@pytest.mark.parametrize("name", ["settled", "handed_on", "max_step", "least_step"])
+@pytest.mark.parametrize("name", ["settled", "enough", "handed_on", "max_step", "least_step"])
 def test_options_that_cannot_be_are_named(name: str) -> None:
     with pytest.raises(ValueError, match=rf"GaussNewton\.{name}: expected a positive number"):
         GaussNewton(**{name: 0.0})
