@@ -9,7 +9,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_body
 from softtwin.reference.dataset import DataSet, DataSetError, differences
 from softtwin.reference.loads import check_loads
-from softtwin.surrogate.train import CheckpointError
+from softtwin.surrogate.checkpoint import CheckpointError
 
 from .config import Config, ConfigError, to_toml
 from .inputs import changes, load_plan, mesh_inputs, plan_entries, solved_data

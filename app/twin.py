@@ -435,7 +435,7 @@ def forward_model(name: str, folder: Path, body: Body, config: Config) -> Iterat
                 f"twin: expected a surrogate in {folder}, found no surrogate.json; train one with `softtwin build`, "
                 "or register with the reference (--model reference), which needs the body alone, and FEniCSx."
             )
-        from softtwin.surrogate.predictor import load  # torch is needed here alone
+        from softtwin.surrogate.twin import load  # torch is needed here alone
 
         yield load(folder, body)
         return

@@ -23,7 +23,10 @@ from softtwin.reference.dataset import DataSet, Samples
 from softtwin.reference.equilibrium import Problem
 from softtwin.reference.generate import plan_from_header
 from softtwin.surrogate.evaluate import evaluate, registration_cosines, table
-from softtwin.surrogate.train import TrainingPlan, train
+from softtwin.surrogate.mlp import Perceptron
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.train import train
 
 RUNS = Path(__file__).parent / "runs"
 
@@ -48,8 +51,8 @@ def main() -> None:
     arguments = parser.parse_args()
     data = DataSet(arguments.data) if arguments.data else make_data(RUNS / "beam", arguments.ranks)
     plans = {
-        "reduced": TrainingPlan(architecture="reduced", seconds=arguments.reduced_seconds),
-        "mlp": TrainingPlan(architecture="mlp", seconds=arguments.mlp_seconds),
+        "reduced": TrainingPlan(Reduced(), seconds=arguments.reduced_seconds),
+        "mlp": TrainingPlan(Perceptron(), seconds=arguments.mlp_seconds),
     }
     figures, evaluations = {"rejected": list(data.rejected().reasons)}, {}
     plan = plan_from_header(data.header)
@@ -73,7 +76,7 @@ def main() -> None:
                     "p5": np.quantile(cosines, 0.05),
                 },
                 "training_seconds": seconds,
-                "weights": sum(array.size for array in surrogate.core.arrays().values()),
+                "weights": sum(weights.numel() for weights in surrogate.network.parameters()),
             }
     print(table(evaluations))
     for name in plans:

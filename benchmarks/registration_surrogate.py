@@ -56,7 +56,7 @@ def make_twin(seconds: float, ranks: int, folder: Path) -> Workspace:
 
 
 def main() -> None:
-    from softtwin.surrogate.predictor import load
+    from softtwin.surrogate.twin import load
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ranks", type=int, default=2)

@@ -107,7 +107,7 @@ ROWS: dict[str, tuple[Callable[[Floats, Body, Generator], Floats], bool, bool]] 
 def forward_model(name: str, twin: Path) -> Iterator[ForwardModel]:
     body = liver()
     if name == "surrogate":
-        from softtwin.surrogate.predictor import load
+        from softtwin.surrogate.twin import load
 
         yield load(twin, body)
         return

@@ -375,6 +375,14 @@ def drop_block(path: Path, block: int) -> None:
     zarr.open_group(str(path), mode="r+")["samples/checksum"][block] = 0
 
 
+def probe_cotangents(body: Body, shapes: Floats, probes: Floats) -> Floats:
+    """The cotangents that probes (s, k) stand for, (s, n, 3): modes on the boundary, as residuals of a registration."""
+    cotangents = np.zeros((len(probes), *body.points.shape))
+    nodes = body.boundary_nodes
+    cotangents[:, nodes] = np.tensordot(probes, shapes[:, nodes], axes=1)
+    return cotangents
+
+
 def differences(data: DataSet, body: Body, plan: Mapping[str, Any]) -> list[str]:
     """What keeps a data set from being one of a body and a plan: a few words each, none where it is.
 

@@ -35,6 +35,7 @@ from .dataset import (
     differences,
     drop_block,
     existing,
+    probe_cotangents,
     write_block,
 )
 from .equilibrium import NewtonOptions, Problem
@@ -400,14 +401,6 @@ def path_loads(data: DataSet, plan: Plan, path: int) -> tuple[Floats, Floats]:
     return top * load, np.sort(rng.uniform(0.0, 1.0, plan.path))
 
 
-def probe_cotangent(body: Body, shapes: Floats, probe: Floats) -> Floats:
-    """The cotangent that a probe stands for, (n, 3): modes on the boundary, as a registration's residual is."""
-    cotangent = np.zeros_like(body.points)
-    nodes = body.boundary_nodes
-    cotangent[nodes] = np.einsum("k,kni->ni", probe, shapes[:, nodes])
-    return cotangent
-
-
 def _solve_path(data: DataSet, plan: Plan, problem: Problem, path: int) -> Iterator[dict[str, Any]]:
     load, factors = path_loads(data, plan, path)
     loaded = data.response.loaded
@@ -422,7 +415,7 @@ def _solve_path(data: DataSet, plan: Plan, problem: Problem, path: int) -> Itera
             state = None
             yield row
             continue
-        cotangent = probe_cotangent(data.body, data.shapes, probe)
+        cotangent = probe_cotangents(data.body, data.shapes, probe[None])[0]
         adjoint = problem.apply_inverse(cotangent.ravel(), state.displacement).reshape(-1, 3)[loaded]
         yield row | _solved_row(state, adjoint, plan)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from softtwin.reference.dataset import DataSet, Samples
 
-from .predictor import Surrogate
+from .model import Surrogate
 
 Floats = NDArray[np.float64]
 _FOLDS = 4
@@ -57,10 +57,10 @@ def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 32) -> Sur
         left_out[held] = missing[held] - (missing[held] @ modes) @ modes.T
     modes, sizes = _modes(missing, most)
     rest = np.sqrt((left_out**2).mean(axis=0).reshape(-1, 3).mean(axis=1))
-    frame = replace(surrogate.frame, error_modes=modes * sizes, error_rest=rest)
+    maps = replace(surrogate.maps, error_modes=modes * sizes, error_rest=rest)
     seen = left_out.reshape(len(missing), -1, 3)[:, data.body.boundary_nodes]
     card = {**surrogate.card, "discrepancy": {"samples": len(missing), "bounded": bounded, "places": _places(seen)}}
-    return Surrogate(surrogate.body, frame, surrogate.core, card)
+    return Surrogate(surrogate.body, maps, surrogate.network, card)
 
 
 def _bounded(missing: Floats) -> tuple[Floats, int]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from softtwin.reference.dataset import DataSet
 
-from .predictor import Surrogate
+from .model import Surrogate
 
 Floats = NDArray[np.float64]
 _LEAST_SPREAD = 1e-3  # of the largest: a direction hardly ever loaded must not make every load a far one
@@ -25,11 +25,11 @@ def with_domain(surrogate: Surrogate, data: DataSet) -> Surrogate:
         data: the data set that it was trained on.
     """
     samples = data.samples("train")
-    coordinates = samples.forces.reshape(len(samples), -1) @ surrogate.frame.encode.T
+    coordinates = samples.forces.reshape(len(samples), -1) @ surrogate.maps.encode.T
     spread = np.sqrt((coordinates**2).mean(axis=0))
     spread = np.maximum(spread, _LEAST_SPREAD * spread.max())
     reach = np.sqrt(((coordinates / spread) ** 2).mean(axis=1)).max()
     largest = np.linalg.norm(samples.displacements, axis=2).max()
     domain = {"reach": float(reach), "displacement_m": float(largest)}
-    frame = replace(surrogate.frame, spread=spread)
-    return Surrogate(surrogate.body, frame, surrogate.core, {**surrogate.card, "domain": domain})
+    maps = replace(surrogate.maps, spread=spread)
+    return Surrogate(surrogate.body, maps, surrogate.network, {**surrogate.card, "domain": domain})

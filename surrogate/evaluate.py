@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.metrics import nodal_distances, relative_error, thesis_error
-from softtwin.reference.dataset import REASONS, DataSet, Samples, Split
+from softtwin.reference.dataset import REASONS, DataSet, Samples, Split, probe_cotangents
 
-from .predictor import Surrogate
-from .reduced import probe_cotangents
+from .model import Surrogate
 
 Floats = NDArray[np.float64]
 Adjoint = Callable[[Floats, Floats], Floats]

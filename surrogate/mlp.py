@@ -2,88 +2,118 @@
 
 from __future__ import annotations
 
-import itertools
+import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from softtwin.reference.dataset import Samples
+from softtwin.reference.dataset import DataSet, Samples
+
+from .architecture import Network
+from .maps import LinearMaps
 
 Floats = NDArray[np.float64]
 
 
-class Perceptron(nn.Module):
-    """Scaled displacements, (s, 3n), from scaled forces, (s, 3l) (Odot 2023, section 4.2.1).
-
-    One input layer, two hidden layers and one output layer, each 3n wide: 9.0 M parameters on the beam of 304
-    hexahedra if every node carries force. Inputs that are zero in every sample are left out, which changes nothing.
-    The thesis does not name the activation of its perceptron; ReLU is the one it recommends (section 3.2).
+@dataclass(frozen=True)
+class Perceptron:
+    """The perceptron's settings (Odot 2023, section 4.2.1, which states neither width nor activation).
 
     Args:
-        inputs: components of the forces, 3l.
-        outputs: components of the displacement, 3n.
+        width: width of the first and of the two hidden layers; None for that of the displacement, 3n.
+
+    Raises:
+        ValueError: an argument out of its range.
+    """
+
+    width: int | None = None
+
+    name: ClassVar[str] = "mlp"
+    rate: ClassVar[float] = 1e-3
+    batch: ClassVar[int] = 50
+    optimizer: ClassVar[type[torch.optim.Optimizer]] = torch.optim.Adam
+
+    def __post_init__(self) -> None:
+        if self.width is not None and self.width < 1:
+            raise ValueError(f"Perceptron.width: expected at least 1, got {self.width}.")
+
+    def lesson(self, data: DataSet, train: Samples, validation: Samples) -> PerceptronLesson:
+        """A `Lesson` with fresh weights."""
+        return PerceptronLesson(data, train, validation, self)
+
+    @staticmethod
+    def revived(tensors: Mapping[str, Tensor]) -> HiddenLayers:
+        """The predicting network from what its `state_dict` was."""
+        bias = tensors["first.bias"]
+        network = HiddenLayers(len(bias), (len(tensors) - 1) // 2).to(bias)
+        network.load_state_dict(dict(tensors))
+        return network.requires_grad_(False)
+
+
+class Bias(nn.Module):
+    """Adds a vector; drawn as that of a linear layer is.
+
+    Args:
+        inputs: of the layer that it belongs to.
+        outputs: length of the vector.
     """
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
-        sizes = (inputs, outputs, outputs, outputs, outputs)
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
+        self.bias = nn.Parameter(torch.empty(outputs).uniform_(-(inputs**-0.5), inputs**-0.5))
+
+    def forward(self, values: Tensor) -> Tensor:
+        """The values, (s, outputs), with the vector added."""
+        return values + self.bias
+
+
+class HiddenLayers(Network):
+    """What lies between the first and the last matrix of the perceptron, ReLU after each layer.
+
+    ReLU since the thesis, which does not name the activation of its perceptron, recommends it (section 3.2).
+
+    Args:
+        width: width of all layers.
+        depth: number of hidden layers.
+        inputs: of the first layer.
+    """
+
+    def __init__(self, width: int, depth: int = 2, inputs: int = 1) -> None:
+        super().__init__()
+        self.first = Bias(inputs, width)
+        self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(depth))
+
+    def forward(self, coordinates: Tensor) -> Tensor:
+        """Last hidden values, (s, w), for first ones before their bias, (s, w)."""
+        values = torch.relu(self.first(coordinates))
+        for layer in self.hidden:
+            values = torch.relu(layer(values))
+        return values
+
+
+class PerceptronNetwork(nn.Module):
+    """Scaled displacements, (s, 3n), from scaled forces, (s, 3l): an input, two hidden and an output layer.
+
+    Args:
+        inputs: components of the forces, 3l.
+        width: width of the first and of the hidden layers.
+        outputs: components of the displacement, 3n.
+    """
+
+    def __init__(self, inputs: int, width: int, outputs: int) -> None:
+        super().__init__()
+        self.enter = nn.Linear(inputs, width, bias=False)
+        self.inner = HiddenLayers(width, inputs=inputs)
+        self.leave = nn.Linear(width, outputs)
 
     def forward(self, forces: Tensor) -> Tensor:
         """Scaled displacements for scaled forces."""
-        values = forces
-        for layer in self.layers[:-1]:
-            values = torch.relu(layer(values))
-        return self.layers[-1](values)
-
-
-@dataclass(frozen=True, eq=False)
-class PerceptronCore:
-    """What lies between the first and the last matrix of a trained perceptron, in plain arrays, with its derivatives.
-
-    Args:
-        weights: `first.bias`, then `hidden.i.weight` and `hidden.i.bias`.
-    """
-
-    weights: dict[str, Floats]
-
-    def arrays(self) -> dict[str, Floats]:
-        """What to store."""
-        return self.weights
-
-    @property
-    def depth(self) -> int:
-        """Number of hidden layers."""
-        return (len(self.weights) - 1) // 2
-
-    def evaluate(self, coordinates: Floats, *, single: bool = False) -> tuple[Floats, Any]:
-        """Last hidden values, (3n,), for first ones before their bias, (3n,), and a record for `push` and `pull`.
-
-        Always in double precision.
-        """
-        z = coordinates + self.weights["first.bias"]
-        active = [z > 0.0]
-        for i in range(self.depth):
-            z = self.weights[f"hidden.{i}.weight"] @ np.maximum(z, 0.0) + self.weights[f"hidden.{i}.bias"]
-            active.append(z > 0.0)
-        return np.maximum(z, 0.0), active
-
-    def push(self, record: Any, tangents: Floats, *, single: bool = False) -> Floats:
-        """Changes of the last hidden values, (3n, k), for changes of the first, (3n, k); always in double precision."""
-        values = record[0][:, None] * tangents
-        for i in range(self.depth):
-            values = record[i + 1][:, None] * (self.weights[f"hidden.{i}.weight"] @ values)
-        return values
-
-    def pull(self, record: Any, cotangent: Floats) -> Floats:
-        """Gradient with respect to the first values, (3n,), for one with respect to the last, (3n,)."""
-        values = record[-1] * cotangent
-        for i in reversed(range(self.depth)):
-            values = record[i] * (values @ self.weights[f"hidden.{i}.weight"])
+        values: Tensor = self.leave(self.inner(self.enter(forces)))
         return values
 
 
@@ -91,10 +121,13 @@ class PerceptronLesson(nn.Module):
     """The perceptron with its training data; the loss is the mean squared error of scaled displacements.
 
     Forces and displacements are divided by one data scale factor each, the root mean square over the training split.
+    Inputs that are zero in every sample are left out, which changes nothing.
 
     Args:
+        data: the data set, for its loaded nodes.
         train: training samples.
         validation: validation samples.
+        settings: of the network.
     """
 
     forces: Tensor
@@ -102,14 +135,16 @@ class PerceptronLesson(nn.Module):
     validation_forces: Tensor
     validation_displacements: Tensor
 
-    def __init__(self, train: Samples, validation: Samples) -> None:
+    def __init__(self, data: DataSet, train: Samples, validation: Samples, settings: Perceptron) -> None:
         super().__init__()
+        self.loaded = data.response.loaded
         self.force_scale = _root_mean_square(train.forces)
         self.displacement_scale = _root_mean_square(train.displacements)
         for name, samples in (("", train), ("validation_", validation)):
             self._store(f"{name}forces", samples.forces / self.force_scale)
             self._store(f"{name}displacements", samples.displacements / self.displacement_scale)
-        self.network = Perceptron(self.forces.shape[1], train.displacements[0].size)
+        inputs, outputs = self.forces.shape[1], train.displacements[0].size
+        self.network = PerceptronNetwork(inputs, settings.width or outputs, outputs)
 
     @property
     def sample_count(self) -> int:
@@ -125,22 +160,25 @@ class PerceptronLesson(nn.Module):
         """Mean squared error over the validation samples."""
         return float(nn.functional.mse_loss(self.network(self.validation_forces), self.validation_displacements))
 
-    def layers(self) -> tuple[Floats, PerceptronCore, Floats, Floats]:
-        """First matrix, (3n, 3l), core, last matrix, (3n, 3n), and last bias, (3n,), with the scale factors in them."""
-        first, *hidden, last = (
-            (layer.weight.detach().double().cpu().numpy(), layer.bias.detach().double().cpu().numpy())
-            for layer in self.network.layers
-            if isinstance(layer, nn.Linear)
-        )
-        weights = {"first.bias": first[1]}
-        for i, (weight, bias) in enumerate(hidden):
-            weights |= {f"hidden.{i}.weight": weight, f"hidden.{i}.bias": bias}
-        scale = self.displacement_scale
-        return first[0] / self.force_scale, PerceptronCore(weights), scale * last[0], scale * last[1]
+    def maps(self) -> LinearMaps:
+        """First matrix, last matrix and last bias, with the scale factors in them."""
+        first, last = _array(self.network.enter.weight), _array(self.network.leave.weight)
+        scale, size = self.displacement_scale, len(last)
+        nothing = np.zeros((size, 0)), np.zeros((0, first.shape[1]))
+        bias = scale * _array(self.network.leave.bias)
+        return LinearMaps(self.loaded, first / self.force_scale, scale * last, bias, *nothing)
+
+    def trained(self) -> Network:
+        """The hidden layers as they are now in double precision."""
+        return copy.deepcopy(self.network.inner).cpu().double().requires_grad_(False)
 
     def _store(self, name: str, fields: Floats) -> None:
         flat = np.ascontiguousarray(fields.reshape(len(fields), -1), dtype=np.float32)
         self.register_buffer(name, torch.from_numpy(flat), persistent=False)
+
+
+def _array(parameter: Tensor) -> Floats:
+    return parameter.detach().double().cpu().numpy()
 
 
 def _root_mean_square(fields: Floats) -> float:

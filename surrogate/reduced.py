@@ -1,193 +1,90 @@
-"""The reduced network: linear response plus a small residual network between POD coordinates."""
+"""The reduced network: linear response plus a small residual network between POD coordinates.
+
+A reduced-basis derivative-informed network (O'Leary-Roseberry et al. 2022, arXiv 2206.10745) on top of the linear
+response: it learns from gradients, too.
+"""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import ClassVar, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import eigh
-from scipy.spatial import cKDTree
-from scipy.special import ndtr
 from torch import Tensor, nn
 
-from softtwin.meshes.body import Body
-from softtwin.reference.dataset import DataSet, LinearResponse, Samples
+from softtwin.reference.dataset import DataSet, LinearResponse, Samples, probe_cotangents
+
+from .architecture import Network
+from .maps import LinearMaps, response_parts
+from .pod import build_basis
+from .symmetry import identity, symmetries
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
-_ROOT_TWO_PI = float(np.sqrt(2.0 * np.pi))
-_TINY = 1e-30  # a number in single precision, too
 _GATE = 0.1  # size of the scaled input, relative to its usual one, below which the correction fades quadratically
+_ROOT_HALF, _DENSITY = 0.5**0.5, float((2.0 * np.pi) ** -0.5)  # of the normal law in the GELU
+_TINY = 1e-30  # a number in single precision, too
 _FLOOR = 0.01  # keeps the semi-relative loss finite for loads near zero
 _SHARE = 4  # one sample in so many enters the gradient's loss: it costs three times the other and needs fewer
-_DENSE = 3000  # largest eigenproblem of the POD solved directly
 
 
-# ------------------------------------------------------------------ symmetries
-
-
-@dataclass(frozen=True, eq=False)
-class Symmetry:
-    """A motion that maps a body onto itself.
+@dataclass(frozen=True)
+class Reduced:
+    """The reduced network's settings.
 
     Args:
-        nodes: the node that each node lands on, (n,).
-        rotation: orthogonal matrix, (3, 3), that vectors turn by; of determinant -1 for a mirror.
-    """
-
-    nodes: Ints
-    rotation: Floats
-
-    def apply(self, fields: Floats) -> Floats:
-        """The nodal vector fields (s, n, 3), moved and turned with the body."""
-        moved = np.empty_like(fields)
-        moved[:, self.nodes] = fields @ self.rotation.T
-        return moved
-
-
-def identity(body: Body) -> Symmetry:
-    """The symmetry that every body has."""
-    return Symmetry(np.arange(len(body.points)), np.eye(3))
-
-
-def symmetries(body: Body, loaded: Ints, tolerance: float = 1e-6) -> tuple[Symmetry, ...]:
-    """The symmetries of a discrete body of isotropic material among axis swaps and mirrors; the identity comes first.
-
-    Axes are those of the coordinates or, where these show none, the principal axes of the nodes. Nodes must land on
-    nodes, cells on cells, fixed on fixed and loaded on loaded nodes.
-
-    Args:
-        body: the body.
-        loaded: numbers of the nodes that may carry force, (l,).
-        tolerance: largest distance between a moved node and its partner, relative to the body's size.
-    """
-    centred = body.points - body.points.mean(axis=0)
-    tree = cKDTree(centred)
-    for axes in (np.eye(3), np.linalg.eigh(centred.T @ centred)[1]):
-        found = [identity(body)]
-        for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)):
-            rotation = axes @ (np.array(signs)[:, None] * np.eye(3)[list(order)]) @ axes.T
-            distance, nodes = tree.query(centred @ rotation.T)
-            moved = not np.allclose(rotation, np.eye(3))
-            if moved and distance.max() < tolerance * body.size and _maps(body, loaded, nodes):
-                found.append(Symmetry(nodes, rotation))
-        if len(found) > 1:
-            return tuple(found)
-    return (identity(body),)
-
-
-def _maps(body: Body, loaded: Ints, nodes: Ints) -> bool:
-    cells = np.sort(body.cells, axis=1)
-    images = np.sort(nodes[body.cells], axis=1)
-    return (
-        len(np.unique(nodes)) == len(nodes)
-        and np.array_equal(np.sort(nodes[body.fixed]), body.fixed)
-        and np.array_equal(np.sort(nodes[loaded]), np.sort(loaded))
-        and np.array_equal(np.unique(cells, axis=0), np.unique(images, axis=0))
-    )
-
-
-# ------------------------------------------------------------------ the basis
-
-
-def correction_modes(corrections: Floats, fixed: Ints, group: Sequence[Symmetry], count: int) -> Floats:
-    """Orthonormal POD modes of nodal fields and of their symmetric images, (3n, r), exactly zero at fixed nodes.
-
-    With several symmetries no cluster of equal singular values is cut, so that the modes span an invariant space.
-
-    Args:
-        corrections: snapshots, (s, n, 3).
-        fixed: numbers of the fixed nodes.
-        group: symmetries of the body, the identity alone for none.
-        count: most modes wanted; fewer come where the snapshots hold fewer.
+        modes: POD modes at most.
+        width: width of its blocks.
+        depth: number of its blocks.
+        sobolev: weight of the gradient's error in the loss; 0 leaves it out.
+        symmetries: use the body's symmetries, if it has any: learn from symmetric images too, and average over them
+            when predicting.
 
     Raises:
-        ValueError: the snapshots are all zero.
-    """
-    energies, modes = _leading(corrections, group, count + 1)
-    if not energies[0] > 0.0:
-        raise ValueError("corrections: expected displacements that differ from the linear response, got none that do.")
-    kept = min(count, int((energies > 1e-12 * energies[0]).sum()))
-    if len(group) > 1:
-        while 1 < kept < len(energies) and energies[kept - 1] - energies[kept] < 1e-6 * energies[kept - 1]:
-            kept -= 1
-    modes = np.ascontiguousarray(modes[:, :kept])
-    modes.reshape(len(corrections[0]), 3, kept)[fixed] = 0.0
-    return modes
-
-
-def _leading(fields: Floats, group: Sequence[Symmetry], count: int) -> tuple[Floats, Floats]:
-    """Largest eigenvalues and eigenvectors of the covariance of the fields and their images, largest first."""
-    rows = np.concatenate([motion.apply(fields).reshape(len(fields), -1) for motion in group])
-    samples, size = rows.shape
-    count = min(count, samples, size)
-    if min(samples, size) > _DENSE:
-        return _leading_iterated(rows, count)
-    small = rows.T @ rows if size <= samples else rows @ rows.T
-    energies, vectors = eigh(small, subset_by_index=(len(small) - count, len(small) - 1))
-    energies, vectors = np.maximum(energies[::-1], 0.0), vectors[:, ::-1]
-    if size > samples:
-        vectors = np.linalg.qr(rows.T @ vectors / np.sqrt(np.maximum(energies, 1e-300)))[0]
-    return energies, vectors
-
-
-def _leading_iterated(rows: Floats, count: int) -> tuple[Floats, Floats]:
-    """The same by subspace iteration (Halko, Martinsson, Tropp 2011), for many samples of many unknowns."""
-    basis = np.random.default_rng(0).standard_normal((rows.shape[1], count + 32))
-    for _ in range(6):
-        basis = np.linalg.qr(rows.T @ (rows @ basis))[0]
-    _, values, turn = np.linalg.svd(rows @ basis, full_matrices=False)
-    return np.square(values[:count]), basis @ turn[:count].T
-
-
-@dataclass(frozen=True, eq=False)
-class ReducedBasis:
-    """The coordinates that the reduced network works in.
-
-    Args:
-        modes: V, orthonormal, (3n, r), zero at fixed nodes.
-        loaded: numbers of the loaded nodes, (l,).
-        turns: what each symmetry does to reduced coordinates, (g, r, r).
+        ValueError: an argument out of its range.
     """
 
-    modes: Floats
-    loaded: Ints
-    turns: Floats
+    modes: int = 64
+    width: int = 256
+    depth: int = 3
+    sobolev: float = 0.03
+    symmetries: bool = True
 
-    @property
-    def count(self) -> int:
-        """Number of modes."""
-        return self.modes.shape[1]
+    name: ClassVar[str] = "reduced"
+    rate: ClassVar[float] = 3e-3
+    batch: ClassVar[int] = 128
+    optimizer: ClassVar[type[torch.optim.Optimizer]] = torch.optim.AdamW
 
-    @property
-    def restricted(self) -> Floats:
-        """Modes at the loaded nodes, (3l, r)."""
-        return self.modes.reshape(-1, 3, self.count)[self.loaded].reshape(-1, self.count)
+    def __post_init__(self) -> None:
+        for name in ("modes", "width", "depth"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"Reduced.{name}: expected at least 1, got {getattr(self, name)}.")
+        if not 0.0 <= self.sobolev < np.inf:
+            raise ValueError(f"Reduced.sobolev: expected a number not below 0, got {self.sobolev}.")
 
-    def images(self, coordinates: Floats) -> Floats:
-        """Reduced coordinates (s, r) of all symmetric images, (g s, r), symmetry by symmetry."""
-        return np.concatenate([coordinates @ turn.T for turn in self.turns])
+    def lesson(self, data: DataSet, train: Samples, validation: Samples) -> ReducedLesson:
+        """A `Lesson` with fresh weights."""
+        return ReducedLesson(data, train, validation, self)
 
-
-def build_basis(corrections: Floats, body: Body, loaded: Ints, group: Sequence[Symmetry], count: int) -> ReducedBasis:
-    """The reduced basis of weighted corrections (s, n, 3): see `correction_modes`."""
-    modes = correction_modes(corrections, body.fixed, group, count)
-    fields = modes.T.reshape(-1, *body.points.shape)
-    turns = np.stack([modes.T @ motion.apply(fields).reshape(len(fields), -1).T for motion in group])
-    return ReducedBasis(modes, loaded, turns)
+    @staticmethod
+    def revived(tensors: Mapping[str, Tensor]) -> AveragedNetwork:
+        """The predicting network from what its `state_dict` was."""
+        depth = sum(name.startswith("inner") and name.endswith("weight") for name in tensors)
+        inner = ReducedNetwork(tensors["input_scale"], 1.0, len(tensors["enter.bias"]), depth)
+        network = AveragedNetwork(inner, tensors["turns"]).to(tensors["turns"])
+        network.load_state_dict(dict(tensors))
+        return network.requires_grad_(False)
 
 
 # ------------------------------------------------------------------ the network
 
 
-class ReducedNetwork(nn.Module):
+class ReducedNetwork(Network):
     """Correction coordinates a = N(c), (s, r), from load coordinates c = V^T b, (s, r).
 
     N(c) = t(x) (M(x) - M(0)) with x = S c, M residual GELU blocks and t(x) = |x| / sqrt(|x|^2 + eps^2): N and its
@@ -212,110 +109,118 @@ class ReducedNetwork(nn.Module):
         self.outer = nn.ModuleList(nn.Linear(width, width) for _ in range(depth))
         self.leave = nn.Linear(width, len(input_scale))
 
+    @property
+    def pairs(self) -> list[tuple[nn.Linear, nn.Linear]]:
+        """The two layers of each block."""
+        return cast("list[tuple[nn.Linear, nn.Linear]]", list(zip(self.inner, self.outer, strict=True)))
+
     def forward(self, coordinates: Tensor) -> Tensor:
         """Correction coordinates, (s, r), metres, for load coordinates, (s, r), newtons."""
         x = coordinates * self.input_scale
-        values = self._blocks(torch.cat([x, torch.zeros_like(x[:1])]))
-        square = x.square().mean(dim=1, keepdim=True)
-        gate = (square / (square + _GATE**2) + 1e-12).sqrt()  # the 1e-12 keeps the root differentiable at zero
-        return gate * (values[:-1] - values[-1:]) * self.output_scale
+        values = self.blocks(torch.cat([x, torch.zeros_like(x[:1])]))
+        return self.gate(x) * (values[:-1] - values[-1:]) * self.output_scale
 
-    def _blocks(self, x: Tensor) -> Tensor:
-        hidden = self.enter(x)
-        for inner, outer in zip(self.inner, self.outer, strict=True):
-            hidden = hidden + outer(nn.functional.gelu(inner(hidden)))
-        return self.leave(hidden)
+    def gate(self, x: Tensor) -> Tensor:
+        """t(x), (s, 1), for scaled inputs, (s, r)."""
+        size = torch.linalg.vector_norm(x, dim=1, keepdim=True)  # whose derivative at zero is zero
+        return size * (size * size + x.shape[1] * _GATE**2).rsqrt()
+
+    def blocks(self, x: Tensor, trace: list[Tensor] | None = None) -> Tensor:
+        """M(x), (s, r), for scaled inputs, (s, r); a trace collects what the activations are given."""
+        linear, gelu = nn.functional.linear, nn.functional.gelu  # calling modules costs as much as what they do here
+        hidden = linear(x, self.enter.weight, self.enter.bias)
+        for inner, outer in self.pairs:
+            z = linear(hidden, inner.weight, inner.bias)
+            if trace is not None:
+                trace.append(z)
+            hidden = hidden + linear(gelu(z), outer.weight, outer.bias)
+        return linear(hidden, self.leave.weight, self.leave.bias)
 
 
-@dataclass(frozen=True, eq=False)
-class ReducedCore:
-    """The trained reduced network in plain arrays, averaged over the symmetries, with its derivatives.
+class AveragedNetwork(ReducedNetwork):
+    """A reduced network averaged over the symmetries of its body, its derivatives by hand.
+
+    By hand since they are wanted in the middle of every step of a registration: 64 tangents of 64 coordinates through
+    three blocks of width 256 take 22 ms by torch.func on one thread, and 1.4 ms so.
 
     Args:
-        weights: the network's arrays by name, and `turns`, (g, r, r).
+        network: gives it its weights.
+        turns: what each symmetry does to the coordinates, (g, r, r); the first is the identity.
     """
 
-    weights: dict[str, Floats]
+    turns: Tensor
+    rest: Tensor
 
-    def arrays(self) -> dict[str, Floats]:
-        """What to store."""
-        return self.weights
+    def __init__(self, network: ReducedNetwork, turns: Tensor) -> None:
+        width, depth = network.enter.out_features, len(network.inner)
+        with torch.random.fork_rng(devices=[]):  # its weights are given: the caller's chance is left alone
+            super().__init__(network.input_scale, float(network.output_scale), width, depth)
+        self.to(network.enter.weight)
+        self.load_state_dict(network.state_dict())
+        with torch.no_grad():
+            self.register_buffer("rest", self.blocks(torch.zeros_like(self.input_scale[None]))[0])
+        self.register_buffer("turns", turns.to(self.rest))
 
-    @property
-    def depth(self) -> int:
-        """Number of residual blocks."""
-        return sum(name.startswith("inner") and name.endswith("weight") for name in self.weights)
+    def forward(self, coordinates: Tensor) -> Tensor:
+        """Correction coordinates, (s, r), metres, for load coordinates, (s, r), newtons."""
+        count, modes = len(self.turns), coordinates.shape[1]
+        turned = torch.einsum("gij,sj->gsi", self.turns, coordinates)
+        values = super().forward(turned.reshape(-1, modes)).reshape(count, -1, modes)
+        return torch.einsum("gij,gsi->sj", self.turns, values) / count
 
-    def evaluate(self, coordinates: Floats, *, single: bool = False) -> tuple[Floats, Any]:
-        """Correction coordinates, (r,), for load coordinates, (r,), and a record that `push` and `pull` go on from.
+    def linearised(self, coordinates: Tensor) -> LinearisedAverage:
+        """The network at one point, (r,)."""
+        return LinearisedAverage(self, coordinates)
 
-        Args:
-            coordinates: of the load.
-            single: in single precision: good to 1e-6, in half of the time.
-        """
-        w: dict[str, Any] = self.weights
-        if single:
-            w, coordinates = self._single, coordinates.astype(np.float32)
-        x = (w["turns"] @ coordinates) * w["input_scale"]  # (g, r)
-        hidden, slopes = x @ w["enter.weight"].T + w["enter.bias"], []
-        for i in range(self.depth):
-            z = hidden @ w[f"inner.{i}.weight"].T + w[f"inner.{i}.bias"]
-            share = ndtr(z)
-            slopes.append(share + z * np.exp(-0.5 * z * z) / _ROOT_TWO_PI)
-            hidden = hidden + (z * share) @ w[f"outer.{i}.weight"].T + w[f"outer.{i}.bias"]
-        values = hidden @ w["leave.weight"].T + w["leave.bias"] - w["rest"]
-        square = (x * x).mean(axis=1, keepdims=True)
-        gate = np.sqrt(square / (square + _GATE**2))
-        # d gate = slope . dx, zero at rest where values is zero as well
-        slope = x * _GATE**2 / (np.maximum(gate, _TINY) * (square + _GATE**2) ** 2 * x.shape[1])
-        mean = np.einsum("gij,gi->j", w["turns"], gate * values * w["output_scale"]) / len(w["turns"])
-        return mean.astype(np.float64), (gate, slope, values, slopes)
+
+class LinearisedAverage:
+    """An averaged network at one point, with derivatives by hand.
+
+    Args:
+        network: the network; its weights need no gradient.
+        coordinates: the point, (r,).
+    """
+
+    def __init__(self, network: AveragedNetwork, coordinates: Tensor) -> None:
+        self.network = network
+        self._x = (network.turns @ coordinates) * network.input_scale  # (g, r)
+        self._trace: list[Tensor] = []
+        self._missing = network.blocks(self._x, self._trace) - network.rest
+        self._gate = network.gate(self._x)
+        values = self._gate * self._missing * network.output_scale
+        self.values = (values[:, None] @ network.turns).mean(dim=0)[0]
 
     @cached_property
-    def _single(self) -> dict[str, NDArray[np.float32]]:
-        return {name: array.astype(np.float32) for name, array in self.weights.items()}
+    def _slopes(self) -> tuple[Tensor, Tensor]:
+        """Of the gate, (g, r), zero at rest where the values are zero as well, and of the activations, (b, g, w)."""
+        x, count = self._x, self._x.shape[1]
+        square = x.square().mean(dim=1, keepdim=True)
+        gate = x * (_GATE**2 / count) / (self._gate.clamp_min(_TINY) * (square + _GATE**2) ** 2)
+        z = torch.stack(self._trace)
+        return gate, 0.5 + 0.5 * torch.erf(_ROOT_HALF * z) + z * torch.exp(-0.5 * z * z) * _DENSITY
 
-    def push(self, record: Any, tangents: Floats, *, single: bool = False) -> Floats:
-        """Change of the correction coordinates, (r, k), for changes of the load coordinates, (r, k).
+    def push(self, tangents: Tensor) -> Tensor:
+        """Changes of the values, (r, k), for changes of the coordinates, (r, k)."""
+        net = self.network
+        gate, slopes = self._slopes
+        dx = (tangents.T @ net.turns.mT) * net.input_scale  # (g, k, r)
+        hidden = dx @ net.enter.weight.T
+        for slope, (inner, outer) in zip(slopes, net.pairs, strict=True):
+            hidden = hidden + (slope[:, None] * (hidden @ inner.weight.T)) @ outer.weight.T
+        change = self._gate[:, None] * (hidden @ net.leave.weight.T)
+        change += (dx @ gate[:, :, None]) * self._missing[:, None]
+        return ((change * net.output_scale) @ net.turns).mean(dim=0).T
 
-        Args:
-            record: from `evaluate`.
-            tangents: changes of the load coordinates.
-            single: in single precision: good to 1e-6, in half of the time.
-        """
-        w: dict[str, Any] = self.weights
-        gate, slope, values, slopes = record
-        if single:
-            w, tangents = self._single, tangents.astype(np.float32)
-            gate, slope, values = (array.astype(np.float32, copy=False) for array in (gate, slope, values))
-            slopes = [array.astype(np.float32, copy=False) for array in slopes]
-        dx = (w["turns"] @ tangents) * w["input_scale"][:, None]  # (g, r, k)
-        hidden = w["enter.weight"] @ dx
-        for i in range(self.depth):
-            hidden = hidden + w[f"outer.{i}.weight"] @ (slopes[i][:, :, None] * (w[f"inner.{i}.weight"] @ hidden))
-        change = gate[:, :, None] * (w["leave.weight"] @ hidden) + values[:, :, None] * (slope[:, None, :] @ dx)
-        change *= w["output_scale"]
-        mean: Floats = (w["turns"].transpose(0, 2, 1) @ change).mean(axis=0).astype(np.float64)
-        return mean
-
-    def pull(self, record: Any, cotangent: Floats) -> Floats:
-        """Gradient with respect to the load coordinates, (r,), for one with respect to the correction, (r,)."""
-        w = self.weights
-        gate, slope, values, slopes = record
-        change = (w["turns"] @ cotangent) * w["output_scale"] / len(w["turns"])  # (g, r)
-        hidden = (gate * change) @ w["leave.weight"]
-        for i in reversed(range(self.depth)):
-            hidden = hidden + (slopes[i] * (hidden @ w[f"outer.{i}.weight"])) @ w[f"inner.{i}.weight"]
-        dx = hidden @ w["enter.weight"] + slope * (values * change).sum(axis=1, keepdims=True)
-        return np.einsum("gij,gi->j", w["turns"], dx * w["input_scale"])
-
-
-def freeze(network: ReducedNetwork, basis: ReducedBasis) -> ReducedCore:
-    """The network's arrays in float64, averaged over the symmetries of the basis."""
-    weights = {name: value.double().cpu().numpy() for name, value in network.state_dict().items()}
-    core = ReducedCore(weights | {"turns": basis.turns, "rest": np.zeros(basis.count)})
-    _, (_, _, values, _) = core.evaluate(np.zeros(basis.count))
-    return ReducedCore(core.weights | {"rest": values[0]})
+    def pull(self, cotangent: Tensor) -> Tensor:
+        """Gradient with respect to the coordinates, (r,), for one with respect to the values, (r,)."""
+        net = self.network
+        gate, slopes = self._slopes
+        change = (net.turns @ cotangent) * (net.output_scale / len(net.turns))  # (g, r)
+        hidden = (self._gate * change) @ net.leave.weight
+        for slope, (inner, outer) in zip(slopes.flip(0), reversed(net.pairs), strict=True):
+            hidden = hidden + (slope * (hidden @ outer.weight)) @ inner.weight
+        dx = hidden @ net.enter.weight + gate * (self._missing * change).sum(dim=1, keepdim=True)
+        return ((dx * net.input_scale)[:, None] @ net.turns).sum(dim=0)[0]
 
 
 # ------------------------------------------------------------------ what it learns
@@ -331,11 +236,7 @@ class ReducedLesson(nn.Module):
         data: the data set, for its body, modes and linear response.
         train: training samples.
         validation: validation samples.
-        modes: most POD modes.
-        width: width of the network.
-        depth: its residual blocks.
-        sobolev: weight of the gradient's error; 0 leaves it out.
-        use_symmetries: learn from symmetric images too, and average over them when predicting.
+        settings: of the network.
 
     Raises:
         ValueError: no training samples, or none that differ from the linear response.
@@ -353,29 +254,19 @@ class ReducedLesson(nn.Module):
     validation_rest: Tensor
     validation_weights: Tensor
 
-    def __init__(
-        self,
-        data: DataSet,
-        train: Samples,
-        validation: Samples,
-        modes: int,
-        width: int,
-        depth: int,
-        sobolev: float,
-        use_symmetries: bool,
-    ) -> None:
+    def __init__(self, data: DataSet, train: Samples, validation: Samples, settings: Reduced) -> None:
         super().__init__()
         self.response = data.response
-        self.sobolev = sobolev
+        self.sobolev = settings.sobolev
         loaded = data.response.loaded
-        group = symmetries(data.body, loaded) if use_symmetries else (identity(data.body),)
+        group = symmetries(data.body, loaded) if settings.symmetries else (identity(data.body),)
         self._rms = float(np.sqrt(np.mean(_sizes(train.displacements) ** 2)))
         corrections = _corrections(data.response, train)
         weights = 1.0 / np.sqrt(self._scale(train))
-        self.basis = build_basis(corrections * weights[:, None, None], data.body, loaded, group, modes)
+        self.basis = build_basis(corrections * weights[:, None, None], data.body, loaded, group, settings.modes)
         self._store_training(data, train, corrections)
         self._store_validation(validation, _corrections(data.response, validation))
-        self._build(train, width, depth)
+        self._build(train, settings)
 
     @property
     def sample_count(self) -> int:
@@ -400,11 +291,18 @@ class ReducedLesson(nn.Module):
         missed = (self.network(self.validation_loads) - self.validation_targets).square().sum(dim=1)
         return float(((missed + self.validation_rest) * self.validation_weights).sqrt().mean())
 
-    def core(self) -> ReducedCore:
-        """The network as it is now, ready to predict."""
-        return freeze(self.network, self.basis)
+    def maps(self) -> LinearMaps:
+        """The linear response, and the modes on both sides of the network."""
+        encode = np.ascontiguousarray(self.basis.restricted.T)
+        left, right = response_parts(self.response)
+        return LinearMaps(self.response.loaded, encode, self.basis.modes, np.zeros(len(left)), left, right)
 
-    def _build(self, train: Samples, width: int, depth: int) -> None:
+    def trained(self) -> AveragedNetwork:
+        """The network as it is now in double precision, averaged over the symmetries."""
+        network = AveragedNetwork(copy.deepcopy(self.network).cpu().double(), torch.from_numpy(self.basis.turns))
+        return network.requires_grad_(False)
+
+    def _build(self, train: Samples, settings: Reduced) -> None:
         linear = self.response.apply(train.forces).reshape(len(train), -1) @ self.basis.modes
         importance = _deviation(self.basis.images(linear))
         # between whitening, which drowns in the small coordinates, and importance, which starves them
@@ -412,7 +310,7 @@ class ReducedLesson(nn.Module):
         spread = np.maximum(spread, 1e-3 * spread.max())  # a direction hardly ever loaded must not be blown up
         scale = (importance / importance.max()) ** 0.25 / spread
         size = float(self.targets.square().mean().sqrt())
-        self.network = ReducedNetwork(_tensor(scale), size, width, depth)
+        self.network = ReducedNetwork(_tensor(scale), size, settings.width, settings.depth)
 
     def _scale(self, samples: Samples) -> Floats:
         return _sizes(samples.displacements) * self._rms + _FLOOR * self._rms**2
@@ -450,14 +348,6 @@ class ReducedLesson(nn.Module):
 
     def _store(self, name: str, values: Floats) -> None:
         self.register_buffer(name, _tensor(values), persistent=False)
-
-
-def probe_cotangents(body: Body, shapes: Floats, probes: Floats) -> Floats:
-    """The cotangents that probes (s, k) stand for, (s, n, 3): combinations of the modes, on the boundary only."""
-    cotangents = np.zeros((len(probes), *body.points.shape))
-    nodes = body.boundary_nodes
-    cotangents[:, nodes] = np.tensordot(probes, shapes[:, nodes], axes=1)
-    return cotangents
 
 
 def _corrections(response: LinearResponse, samples: Samples) -> Floats:

@@ -13,8 +13,12 @@ from softtwin.reference.dataset import DataSet
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.evaluate import evaluate
-from softtwin.surrogate.predictor import Surrogate, load, save
-from softtwin.surrogate.train import TrainingPlan, train
+from softtwin.surrogate.mlp import Perceptron
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.train import train
+from softtwin.surrogate.twin import load, save
 
 from ..config import to_toml
 from ..inputs import check_trained, current_data, train_inputs, validate_inputs
@@ -42,10 +46,9 @@ def _train(space: Workspace, data: DataSet, fresh: bool) -> Surrogate:
     if fresh:
         shutil.rmtree(space.training, ignore_errors=True)
     section = space.config.training
+    is_reduced = section.architecture == Reduced.name
     plan = TrainingPlan(
-        architecture=section.architecture,
-        modes=section.modes,
-        width=section.width,
+        architecture=Reduced(modes=section.modes, width=section.width) if is_reduced else Perceptron(),
         seconds=section.seconds,
         epochs=section.epochs or None,
         seed=section.seed,

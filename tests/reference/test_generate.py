@@ -20,9 +20,9 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference import dataset
-from softtwin.reference.dataset import SPLITS, DataSet, DataSetError, drop_block
+from softtwin.reference.dataset import SPLITS, DataSet, DataSetError, drop_block, probe_cotangents
 from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.generate import DamagedBlock, Plan, generate, linear_response, probe_cotangent, solve_block
+from softtwin.reference.generate import DamagedBlock, Plan, generate, linear_response, solve_block
 from softtwin.reference.loads import LoadPlan
 
 PLAN = Plan(
@@ -95,7 +95,7 @@ def test_samples_are_equilibria_with_their_adjoints(undisturbed: DataSet) -> Non
             forces[loaded] = load
             balance = (problem.internal_forces(u) - forces)[problem.body.free]
             assert np.linalg.norm(balance) <= 1.01e-8 * np.linalg.norm(load)
-            cotangent = probe_cotangent(problem.body, undisturbed.shapes, probe)
+            cotangent = probe_cotangents(problem.body, undisturbed.shapes, probe[None])[0]
             again = problem.apply_inverse(cotangent.ravel(), u).reshape(-1, 3)[loaded]
             np.testing.assert_allclose(adjoint, again, rtol=1e-9, atol=1e-12)
 

@@ -22,7 +22,10 @@ from softtwin.reference.loads import LoadPlan
 from softtwin.reference.model import ReferenceModel
 from softtwin.reference.outcome import NotConverged
 from softtwin.registration.forward import ForwardModel
-from softtwin.surrogate.train import TrainingPlan, train
+from softtwin.surrogate.mlp import Perceptron
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.train import train
 
 pytestmark = pytest.mark.fenicsx
 ALL, EXACT = ("reference", "reduced", "mlp"), ("reference", "reduced")
@@ -36,10 +39,13 @@ def data(tmp_path_factory: pytest.TempPathFactory, hexahedral_beam: Body) -> Dat
     return made
 
 
+_NETWORKS = {"reduced": Reduced(modes=16, width=32), "mlp": Perceptron()}
+
+
 @pytest.fixture(scope="module", params=ALL)
 def model(request: pytest.FixtureRequest, data: DataSet) -> Iterator[ForwardModel]:
     if request.param != "reference":
-        yield train(data, TrainingPlan(architecture=request.param, epochs=40, modes=16, width=32))
+        yield train(data, TrainingPlan(_NETWORKS[request.param], epochs=40))
         return
     with Problem(data.body, PLAN.build_material(), NewtonOptions(tolerance=1e-11)) as problem:
         yield ReferenceModel(problem)
@@ -198,7 +204,7 @@ def test_a_solve_that_fails_leaves_earlier_states_as_they_are(data: DataSet, loa
 
 def test_the_surrogate_is_close_to_the_reference_on_held_out_loads(data: DataSet) -> None:
     """Better than the linear response it starts from, on equilibria it has not seen."""
-    surrogate = train(data, TrainingPlan(epochs=200, modes=16, width=64))
+    surrogate = train(data, TrainingPlan(Reduced(modes=16, width=64), epochs=200))
     test = data.samples("test")
     for forces, truth in zip(test.forces, test.displacements, strict=True):
         linear = data.response.apply(forces[None])[0]

@@ -18,8 +18,11 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.metrics import HEXAHEDRON_EDGES
 from softtwin.meshes.shapes import beam
 from softtwin.reference.dataset import DataSet, LinearResponse, create, write_block
-from softtwin.surrogate.predictor import Surrogate
-from softtwin.surrogate.train import TrainingPlan, train
+from softtwin.surrogate.mlp import Perceptron
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.train import train
 
 Floats = NDArray[np.float64]
 
@@ -131,7 +134,7 @@ def make_data(small_beam: Body, tmp_path: Path) -> Maker:
 
 @pytest.fixture(scope="session")
 def small_plan() -> TrainingPlan:
-    return TrainingPlan(modes=6, width=32, depth=2, batch=32, epochs=30)
+    return TrainingPlan(Reduced(modes=6, width=32, depth=2), batch=32, epochs=30)
 
 
 @pytest.fixture(scope="session")
@@ -141,7 +144,7 @@ def reduced(data: DataSet, small_plan: TrainingPlan) -> Surrogate:
 
 @pytest.fixture(scope="session")
 def perceptron(data: DataSet) -> Surrogate:
-    return train(data, TrainingPlan(architecture="mlp", batch=32, epochs=30))
+    return train(data, TrainingPlan(Perceptron(), batch=32, epochs=30))
 
 
 @pytest.fixture(params=["reduced", "perceptron"])

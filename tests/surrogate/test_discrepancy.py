@@ -10,7 +10,8 @@ import pytest
 from softtwin.reference.dataset import DataSet
 from softtwin.surrogate import discrepancy
 from softtwin.surrogate.discrepancy import relative_errors, with_discrepancy
-from softtwin.surrogate.predictor import Surrogate, load, save
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.twin import load, save
 
 
 def test_patterns_hold_most_of_held_out_errors(reduced: Surrogate, data: DataSet) -> None:

@@ -8,7 +8,7 @@ import pytest
 from softtwin.meshes.shapes import beam
 from softtwin.reference.dataset import DataSet
 from softtwin.surrogate.evaluate import DEFINITIONS, cosine, evaluate, registration_cosines, spread, table
-from softtwin.surrogate.predictor import Surrogate
+from softtwin.surrogate.model import Surrogate
 
 
 def _predictions(surrogate: Surrogate, data: DataSet) -> np.ndarray:
@@ -75,6 +75,6 @@ def test_cosine_of_known_angles() -> None:
 
 
 def test_a_surrogate_of_another_body_is_refused(reduced: Surrogate, data: DataSet) -> None:
-    other = Surrogate(beam((4, 2, 2), (0.4, 0.2, 0.3)), reduced.frame, reduced.core, reduced.card)
+    other = Surrogate(beam((4, 2, 2), (0.4, 0.2, 0.3)), reduced.maps, reduced.network, reduced.card)
     with pytest.raises(ValueError, match="another body"):
         evaluate(other, data)

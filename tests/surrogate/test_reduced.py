@@ -10,14 +10,10 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.dataset import DataSet
 from softtwin.surrogate import reduced as reduced_module
-from softtwin.surrogate.predictor import Surrogate
-from softtwin.surrogate.reduced import (
-    ReducedLesson,
-    correction_modes,
-    freeze,
-    identity,
-    symmetries,
-)
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.pod import correction_modes
+from softtwin.surrogate.reduced import Reduced, ReducedLesson
+from softtwin.surrogate.symmetry import identity, symmetries
 
 
 def _loaded(body: Body) -> np.ndarray:
@@ -27,7 +23,7 @@ def _loaded(body: Body) -> np.ndarray:
 def _lesson(data: DataSet, use_symmetries: bool = True) -> ReducedLesson:
     torch.manual_seed(0)
     samples = data.samples("train")
-    return ReducedLesson(data, samples, samples, 6, 24, 2, 0.03, use_symmetries)
+    return Reduced(modes=6, width=24, depth=2, symmetries=use_symmetries).lesson(data, samples, samples)
 
 
 @pytest.mark.parametrize(
@@ -88,16 +84,6 @@ def test_snapshots_that_are_all_zero_are_refused(small_beam: Body) -> None:
         correction_modes(fields, small_beam.fixed, (identity(small_beam),), 4)
 
 
-def test_plain_arrays_compute_what_the_network_computes(data: DataSet) -> None:
-    lesson = _lesson(data, use_symmetries=False)
-    coordinates = lesson.loads[:5].double()
-    expected = lesson.network.double()(coordinates).detach().numpy()
-    core = freeze(lesson.network, lesson.basis)
-    found = np.stack([core.evaluate(c)[0] for c in coordinates.numpy()])
-    # the network's gate carries 1e-12 under its root
-    assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
-
-
 def test_reduced_loss_is_the_full_loss_up_to_a_constant(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
     """Differences of the loss between two networks agree with those of the loss in all 3n unknowns."""
     lesson = _lesson(data, use_symmetries=False)
@@ -115,19 +101,19 @@ def test_reduced_loss_is_the_full_loss_up_to_a_constant(data: DataSet, monkeypat
 
 
 def _full_loss(data: DataSet, lesson: ReducedLesson) -> float:
-    samples, core, basis = data.samples("train"), lesson.core(), lesson.basis
+    samples, network, basis = data.samples("train"), lesson.trained(), lesson.basis
     flat = samples.displacements.reshape(len(samples), -1)
     rms = np.sqrt((flat**2).sum(axis=1).mean())
     total = 0.0
     for i in range(len(samples)):
         load = samples.forces[i].ravel()
-        values, record = core.evaluate(load @ basis.restricted)
-        error = data.response.apply(samples.forces[i : i + 1]).ravel() + basis.modes @ values - flat[i]
+        here = network.linearised(torch.from_numpy(load @ basis.restricted))
+        error = data.response.apply(samples.forces[i : i + 1]).ravel() + basis.modes @ here.values.numpy() - flat[i]
         cotangent = np.zeros_like(data.body.points)
         nodes = data.body.boundary_nodes
         cotangent[nodes] = np.tensordot(samples.probes[i], data.shapes[:, nodes], axes=1)
         gradient = cotangent.ravel() @ data.response.left @ data.response.right
-        gradient = gradient + core.pull(record, cotangent.ravel() @ basis.modes) @ basis.restricted.T
+        gradient = gradient + here.pull(torch.from_numpy(cotangent.ravel() @ basis.modes)).numpy() @ basis.restricted.T
         missed = np.sum((gradient - samples.adjoints[i].ravel()) ** 2) / np.sum(samples.adjoints[i] ** 2)
         total += error @ error / (np.linalg.norm(flat[i]) * rms + 0.01 * rms**2) + 0.03 * missed
     return total / len(samples)
@@ -151,7 +137,7 @@ def test_tangent_at_rest_is_the_linear_response(reduced: Surrogate, data: DataSe
 
 
 def test_prediction_turns_with_the_load(reduced: Surrogate, forces: np.ndarray) -> None:
-    group = symmetries(reduced.body, reduced.frame.loaded)
+    group = symmetries(reduced.body, reduced.maps.loaded)
     assert len(group) == 8
     expected = reduced.solve(forces).displacement
     for motion in group:

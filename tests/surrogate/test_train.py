@@ -13,10 +13,16 @@ import pytest
 import torch
 
 from softtwin.reference.dataset import DataSet, DataSetError, drop_block
-from softtwin.surrogate import train as training
+from softtwin.surrogate import course as training
+from softtwin.surrogate.architecture import Architecture
+from softtwin.surrogate.checkpoint import CHECKPOINT, CheckpointError
+from softtwin.surrogate.course import Course, Diverged, fit, rate_factor
 from softtwin.surrogate.evaluate import evaluate
-from softtwin.surrogate.predictor import Surrogate
-from softtwin.surrogate.train import CHECKPOINT, CheckpointError, Course, Diverged, TrainingPlan, rate_factor, train
+from softtwin.surrogate.mlp import Perceptron
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.train import train
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +49,8 @@ class Ticking:
 
 
 def _weights(surrogate: Surrogate) -> dict[str, np.ndarray]:
-    return surrogate.core.arrays()
+    tensors = {**surrogate.network.state_dict(), "encode": surrogate.maps.encode, "decode": surrogate.maps.decode}
+    return {name: np.asarray(tensor) for name, tensor in tensors.items()}
 
 
 def _same(a: Surrogate, b: Surrogate) -> bool:
@@ -62,14 +69,14 @@ def _stop_in_round(monkeypatch: pytest.MonkeyPatch, number: int, act: Any) -> No
     monkeypatch.setattr(Course, "on_train_epoch_start", stopping)
 
 
-@pytest.mark.parametrize("architecture", ["reduced", "mlp"])
-def test_four_samples_are_learnt_by_heart(data: DataSet, tmp_path: Path, architecture: str) -> None:
-    plan = TrainingPlan(architecture=architecture, samples=4, width=32, symmetries=False, epochs=240)  # type: ignore[arg-type]
+@pytest.mark.parametrize("architecture", [Reduced(width=32, symmetries=False), Perceptron()], ids=["reduced", "mlp"])
+def test_four_samples_are_learnt_by_heart(data: DataSet, tmp_path: Path, architecture: Architecture) -> None:
+    plan = TrainingPlan(architecture, samples=4, epochs=240)
     four = data.samples("train", 4)
-    lesson = training._build_lesson(data, plan, {"train": four, "validation": four})
+    lesson = architecture.lesson(data, four, four)
     course = Course(lesson, plan, "")
     start = lesson.error()
-    training._fit(course, tmp_path / CHECKPOINT, False)
+    fit(course, tmp_path / CHECKPOINT, False)
     assert course.best_error < 0.02 * start
 
 
@@ -204,7 +211,7 @@ def test_a_truncated_checkpoint_is_refused(data: DataSet, short: TrainingPlan, t
 def test_a_checkpoint_of_another_plan_is_refused(data: DataSet, short: TrainingPlan, tmp_path: Path) -> None:
     train(data, short, tmp_path)
     with pytest.raises(CheckpointError, match=r"another plan \(differs in width, seed\)"):
-        train(data, replace(short, width=16, seed=3), tmp_path)
+        train(data, replace(short, architecture=Reduced(modes=6, width=16, depth=2), seed=3), tmp_path)
 
 
 def test_a_checkpoint_of_another_data_set_is_refused(
@@ -228,14 +235,25 @@ def test_a_checkpoint_cannot_run_code(data: DataSet, short: TrainingPlan, tmp_pa
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"architecture": "oracle"}, r"architecture: expected one of \['mlp', 'reduced'\], got 'oracle'"),
-        ({"modes": 0}, "modes: expected at least 1, got 0"),
         ({"epochs": 0}, "epochs: expected at least 1"),
         ({"seconds": -1.0}, "seconds: expected a positive number"),
         ({"learning_rate": float("nan")}, "learning_rate: expected a positive number"),
-        ({"sobolev": -0.1}, "sobolev: expected a number not below 0"),
+        ({"batch": -1}, "batch: expected at least 1, got -1"),
     ],
 )
 def test_plans_out_of_range_are_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         TrainingPlan(**change)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (lambda: Reduced(modes=0), r"Reduced\.modes: expected at least 1, got 0"),
+        (lambda: Reduced(sobolev=-0.1), r"Reduced\.sobolev: expected a number not below 0"),
+        (lambda: Perceptron(width=0), r"Perceptron\.width: expected at least 1, got 0"),
+    ],
+)
+def test_settings_of_a_network_out_of_range_are_refused(settings: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        settings()

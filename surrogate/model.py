@@ -1,106 +1,27 @@
-"""The trained surrogate as a forward model: displacement and derivatives from forces, saved and loaded as a twin."""
+"""The trained surrogate as a forward model: displacement and derivatives from forces."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
+import copy
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_tensors
-from safetensors.numpy import save as save_tensors
 from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
-from softtwin.reference.dataset import LinearResponse
 from softtwin.reference.loading import checked_array
 
-from .mlp import PerceptronCore
-from .reduced import ReducedCore
+from .architecture import Linearisation, Network
+from .maps import LinearMaps
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-WEIGHTS = "surrogate.safetensors"
-CARD = "surrogate.json"
-FORMAT = 1
-NOTICE = "Research software, not a medical device: not for diagnosis or treatment."
-
-_CORES: dict[str, type[ReducedCore] | type[PerceptronCore]] = {"reduced": ReducedCore, "mlp": PerceptronCore}
-
-
-class TwinError(ValueError):
-    """A twin that cannot be used: missing, truncated, changed, or of another body."""
-
-
-class Core(Protocol):
-    """A small network with its derivatives: what a frame needs in its middle."""
-
-    def arrays(self) -> dict[str, Floats]:
-        """What to store."""
-        ...
-
-    def evaluate(self, coordinates: Floats, *, single: bool = False) -> tuple[Floats, Any]:
-        """Values, and a record that the derivatives go on from; `single`: 1e-6 will do."""
-        ...
-
-    def push(self, record: Any, tangents: Floats, *, single: bool = False) -> Floats:
-        """Changes of the values for changes of the coordinates, column by column; `single`: 1e-6 will do."""
-        ...
-
-    def pull(self, record: Any, cotangent: Floats) -> Floats:
-        """Gradient with respect to the coordinates for one with respect to the values."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """The linear maps around a core N: u = offset + left right b + decode N(encode b).
-
-    Args:
-        loaded: numbers of the nodes that may carry force, (l,); b are the forces there, (3l,).
-        encode: (d, 3l).
-        decode: (3n, e), m.
-        offset: (3n,), m.
-        left: of the linear response, (3n, r), m; r = 0 for none.
-        right: of the linear response, (r, 3l), 1/N; None for the identity.
-        spread: root mean square of each coordinate over the training loads, (d,); None where it was not measured.
-        error_modes: modes of `Discrepancy`, (3n, m); None where they were not measured.
-        error_rest: its rest, (n,).
-    """
-
-    loaded: Ints
-    encode: Floats
-    decode: Floats
-    offset: Floats
-    left: Floats
-    right: Floats | None = None
-    spread: Floats | None = None
-    error_modes: Floats | None = None
-    error_rest: Floats | None = None
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """What to store."""
-        named = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return {name: array for name, array in named.items() if array is not None}
-
-    def linear(self, columns: Floats) -> Floats:
-        """Linear part of the displacement, (3n, ...), for forces at the loaded nodes, (3l, ...)."""
-        return self.left @ (columns if self.right is None else self.right @ columns)
-
-    def linear_adjoint(self, cotangent: Floats) -> Floats:
-        """Linear part of the gradient, (3l,), for a gradient with respect to the displacement, (3n,)."""
-        row = cotangent @ self.left
-        return row if self.right is None else row @ self.right
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,12 +39,6 @@ class Discrepancy:
     places: float
 
 
-def response_parts(response: LinearResponse) -> tuple[Floats, Floats | None]:
-    """Left and right matrix of a linear response; one matrix and None where that is cheaper to apply."""
-    left, right = response.left, response.right
-    return (left @ right, None) if len(right) >= right.shape[1] else (left, right)
-
-
 class SurrogateState:
     """What a surrogate predicts under one load, with its derivatives: a value.
 
@@ -136,10 +51,10 @@ class SurrogateState:
     negative_pivots: int | None = None  # a network has no tangent to count them of
 
     def __init__(self, surrogate: Surrogate, coordinates: Floats, linear: Floats) -> None:
-        frame = surrogate.frame
+        maps = surrogate.maps
         self._surrogate, self.coordinates = surrogate, coordinates
-        values, self._record = surrogate.core.evaluate(coordinates)
-        self.displacement: Floats = (frame.offset + linear + frame.decode @ values).reshape(-1, 3)
+        self._inner = surrogate.network.linearised(torch.from_numpy(coordinates))
+        self.displacement: Floats = (maps.offset + linear + maps.decode @ self._inner.values.numpy()).reshape(-1, 3)
 
     @property
     def extent(self) -> float | None:
@@ -147,7 +62,7 @@ class SurrogateState:
 
         The larger of two measures: the network's coordinates in units of their spread, and the largest displacement.
         """
-        spread, domain = self._surrogate.frame.spread, self._surrogate.card.get("domain")
+        spread, domain = self._surrogate.maps.spread, self._surrogate.card.get("domain")
         if spread is None or domain is None:
             return None
         far = np.sqrt(((self.coordinates / spread) ** 2).mean()) / domain["reach"]
@@ -160,10 +75,9 @@ class SurrogateState:
         Raises:
             ValueError: another shape, numbers that are not finite, or changes at nodes that never carry load.
         """
-        frame, core = self._surrogate.frame, self._surrogate.core
+        maps = self._surrogate.maps
         columns = self._surrogate.at_loaded("changes", changes)
-        inner = _tangent(core, self._record, frame.encode @ columns)
-        return frame.linear(columns) + frame.decode @ inner
+        return maps.linear(columns) + maps.decode @ tangent(self._inner, maps.encode @ columns)
 
     def pull(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3): J^T g, zero at nodes that never carry load.
@@ -177,11 +91,11 @@ class SurrogateState:
         given, shape = np.asarray(cotangent, dtype=np.float64), self.displacement.shape
         if given.ndim == 3 and len(given):
             return np.stack([self.pull(each) for each in given])
-        frame, core = self._surrogate.frame, self._surrogate.core
+        maps = self._surrogate.maps
         flat = checked_array("SurrogateState.cotangent", given, shape).ravel()
         gradient = np.zeros_like(flat)
-        inner = core.pull(self._record, flat @ frame.decode)
-        gradient[self._surrogate.rows] = frame.linear_adjoint(flat) + inner @ frame.encode
+        inner = self._inner.pull(torch.from_numpy(flat @ maps.decode)).numpy()
+        gradient[self._surrogate.rows] = maps.linear_adjoint(flat) + inner @ maps.encode
         return gradient.reshape(-1, 3)
 
 
@@ -192,19 +106,24 @@ class Surrogate:
 
     Args:
         body: the body it was trained on.
-        frame: linear maps around the network.
-        core: the network.
+        maps: linear maps around the network.
+        network: the network, in double precision, on the CPU, its weights frozen.
         card: what it was trained on and how well it does.
     """
 
-    def __init__(self, body: Body, frame: Frame, core: Core, card: Mapping[str, Any]) -> None:
+    def __init__(self, body: Body, maps: LinearMaps, network: Network, card: Mapping[str, Any]) -> None:
         self.body = body
-        self.frame = frame
-        self.core = core
+        self.maps = maps
+        self.network = network
         self.card: Mapping[str, Any] = MappingProxyType(dict(card))
-        self.rows = (3 * frame.loaded[:, None] + np.arange(3)).ravel()
-        self._wanted: tuple[Ints, Floats] = np.zeros(0, dtype=np.int64), frame.left[:0]  # rows, left's rows
-        self._idle = np.setdiff1d(np.arange(len(body.points)), np.union1d(frame.loaded, body.fixed))
+        self.rows = (3 * maps.loaded[:, None] + np.arange(3)).ravel()
+        self._wanted: tuple[Ints, Floats] = np.zeros(0, dtype=np.int64), maps.left[:0]  # rows, left's rows
+        self._idle = np.setdiff1d(np.arange(len(body.points)), np.union1d(maps.loaded, body.fixed))
+
+    @cached_property
+    def single(self) -> Network:
+        """The network in single precision: good to 1e-6, in half of the time."""
+        return copy.deepcopy(self.network).float()
 
     @property
     def error(self) -> float:
@@ -215,7 +134,7 @@ class Surrogate:
     @cached_property
     def discrepancy(self) -> Discrepancy | None:
         """The errors of the validation samples as patterns; None where they were not measured."""
-        modes, rest, known = self.frame.error_modes, self.frame.error_rest, self.card.get("discrepancy")
+        modes, rest, known = self.maps.error_modes, self.maps.error_rest, self.card.get("discrepancy")
         return None if modes is None or rest is None or not known else Discrepancy(modes, rest, known["places"])
 
     def solve(self, forces: ArrayLike, near: Any = None) -> SurrogateState:
@@ -232,7 +151,7 @@ class Surrogate:
         load = checked_array("Surrogate.forces", forces, self.body.points.shape)
         self._refuse_idle("forces", np.abs(load).max(axis=1))
         loads = load.ravel()[self.rows]
-        return SurrogateState(self, self.frame.encode @ loads, self.frame.linear(loads))
+        return SurrogateState(self, self.maps.encode @ loads, self.maps.linear(loads))
 
     def reduced(self, nodes: ArrayLike, basis: ArrayLike) -> ReducedSurrogate:
         """The surrogate between a few force coefficients and a few nodes, all that can be computed before computed.
@@ -259,12 +178,12 @@ class Surrogate:
             columns: forces at the loaded nodes, (3l, k), newtons.
         """
         if not np.array_equal(self._wanted[0], rows):  # each cold frame asks for the same again
-            self._wanted = rows, np.ascontiguousarray(self.frame.left[rows])
-        return self._wanted[1] @ (columns if self.frame.right is None else self.frame.right @ columns)
+            self._wanted = rows, np.ascontiguousarray(self.maps.left[rows])
+        return self._wanted[1] @ (columns if self.maps.right is None else self.maps.right @ columns)
 
     def with_card(self, **entries: Any) -> Surrogate:
         """The same surrogate with more entries in its card, for instance held-out errors."""
-        return Surrogate(self.body, self.frame, self.core, {**self.card, **entries})
+        return Surrogate(self.body, self.maps, self.network, {**self.card, **entries})
 
     def at_loaded(self, name: str, columns: ArrayLike) -> Floats:
         """Columns of nodal forces (3n, k) at the loaded nodes, (3l, k).
@@ -284,16 +203,18 @@ class Surrogate:
         bad = self._idle[sizes[self._idle] > 0.0]
         if len(bad):
             raise ValueError(
-                f"Surrogate.{name}: expected forces at the {len(self.frame.loaded)} nodes that carried load in "
-                f"training (surrogate.frame.loaded), got some at {len(bad)} other nodes, first {bad[:5].tolist()}."
+                f"Surrogate.{name}: expected forces at the {len(self.maps.loaded)} nodes that carried load in "
+                f"training (surrogate.maps.loaded), got some at {len(bad)} other nodes, first {bad[:5].tolist()}."
             )
 
 
-def _tangent(core: Core, record: Any, columns: Floats, *, single: bool = False) -> Floats:
-    """Core derivative times columns, (e, k), by way of the full derivative where the columns outnumber it."""
-    if columns.shape[1] > len(columns):
-        return core.push(record, np.eye(len(columns)), single=single) @ columns
-    return core.push(record, columns, single=single)
+def tangent(inner: Linearisation, columns: Floats) -> Floats:
+    """Network derivative times columns (d, k), (e, k), by way of the whole derivative where they outnumber it."""
+    size, kind = columns.shape[0], inner.values.dtype
+    if columns.shape[1] > size:
+        whole = inner.push(torch.eye(size, dtype=kind)).numpy()
+        return whole.astype(np.float64) @ columns
+    return inner.push(torch.from_numpy(columns).to(kind)).numpy().astype(np.float64, copy=False)
 
 
 class ReducedSurrogateState:
@@ -306,8 +227,9 @@ class ReducedSurrogateState:
 
     def __init__(self, model: ReducedSurrogate, coefficients: Floats) -> None:
         self.model, self.coefficients = model, coefficients
-        self._found = model.surrogate.core.evaluate(model.encode @ coefficients, single=True)
-        moved = model.offset_rows + model.rows @ np.concatenate([coefficients, self._found[0]])
+        coordinates = (model.encode @ coefficients).astype(np.float32)
+        self._inner = model.surrogate.single.linearised(torch.from_numpy(coordinates))
+        moved = model.offset_rows + model.rows @ np.concatenate([coefficients, self._inner.values.numpy()])
         self.positions: Floats = moved.reshape(-1, 3)
 
     @cached_property
@@ -319,7 +241,7 @@ class ReducedSurrogateState:
 
     @cached_property
     def _tangent(self) -> Floats:
-        return _tangent(self.model.surrogate.core, self._found[1], self.model.encode, single=True)
+        return tangent(self._inner, self.model.encode)
 
     def jacobian(self, rows: csr_array) -> Floats:
         """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p); no more is touched."""
@@ -347,13 +269,15 @@ class ReducedSurrogate:
     """
 
     def __init__(self, surrogate: Surrogate, nodes: Ints, basis: Floats) -> None:
-        frame = surrogate.frame
+        maps = surrogate.maps
         picked = (3 * nodes[:, None] + np.arange(3)).ravel()
         self.surrogate, self._basis, self._combination = surrogate, basis, np.eye(basis.shape[1])
-        self.encode = frame.encode @ basis
-        self._linear_rows, self._decode_rows = surrogate.linear_rows(picked, basis), frame.decode[picked]
-        self.rows = np.hstack([self._linear_rows, self._decode_rows])  # by the coefficients and by what the core says
-        self.offset_rows = frame.offset[picked]
+        self.encode = maps.encode @ basis
+        self._linear_rows, self._decode_rows = surrogate.linear_rows(picked, basis), maps.decode[picked]
+        self.rows = np.hstack(
+            [self._linear_rows, self._decode_rows]
+        )  # by the coefficients and by what the network says
+        self.offset_rows = maps.offset[picked]
 
     @property
     def count(self) -> int:
@@ -362,7 +286,7 @@ class ReducedSurrogate:
 
     def combined(self, matrix: Floats) -> ReducedSurrogate:
         """The same for the basis times a matrix, (k, j), for the price of some small products."""
-        other = copy(self)
+        other = copy.copy(self)
         other.__dict__.pop("_linear", None)
         other.encode, other._combination = self.encode @ matrix, self._combination @ matrix
         other._linear_rows = self._linear_rows @ matrix
@@ -371,7 +295,7 @@ class ReducedSurrogate:
 
     @cached_property
     def _linear(self) -> Floats:
-        return self.surrogate.frame.linear(self._basis @ self._combination)
+        return self.surrogate.maps.linear(self._basis @ self._combination)
 
     def linear(self, coefficients: Floats) -> Floats:
         """Linear part of the displacement of all nodes, (3n,), metres."""
@@ -389,89 +313,3 @@ class ReducedSurrogate:
         if isinstance(near, ReducedSurrogateState) and near.model is self and np.array_equal(near.coefficients, c):
             return near
         return ReducedSurrogateState(self, c)
-
-
-# ------------------------------------------------------------------ on disk
-
-
-def save(surrogate: Surrogate, folder: Path | str) -> None:
-    """Write weights (safetensors) and card (JSON) into a folder; the body is written apart, with `meshes.files`.
-
-    Args:
-        surrogate: what to save.
-        folder: made if it is not there; files of the same names are replaced.
-    """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    frame = {f"frame.{name}": np.ascontiguousarray(array) for name, array in surrogate.frame.arrays().items()}
-    core = {f"core.{name}": np.ascontiguousarray(array) for name, array in surrogate.core.arrays().items()}
-    weights = save_tensors(frame | core)
-    card = {
-        **surrogate.card,
-        "format": FORMAT,
-        "body": surrogate.body.fingerprint,
-        "weights": hashlib.sha256(weights).hexdigest(),
-        "notice": NOTICE,
-    }
-    _replace(folder / WEIGHTS, weights)
-    _replace(folder / CARD, json.dumps(card, indent=2, allow_nan=False).encode())
-
-
-def _replace(path: Path, content: bytes) -> None:
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
-
-
-def load(folder: Path | str, body: Body) -> Surrogate:
-    """The surrogate saved in a folder.
-
-    Args:
-        folder: where `save` wrote it.
-        body: the body it was trained on.
-
-    Raises:
-        TwinError: files missing, truncated or changed, another format, or another body.
-    """
-    folder = Path(folder)
-    card = _read_card(folder / CARD)
-    if card["body"] != body.fingerprint:
-        raise TwinError(
-            f"load.body: the twin in {folder} belongs to another body (fingerprint {card['body'][:12]}..., "
-            f"got {body.fingerprint[:12]}...); nodes, cells and fixed nodes must be those it was trained on."
-        )
-    tensors = _read_weights(folder / WEIGHTS, card["weights"])
-    frame = {name.removeprefix("frame."): array for name, array in tensors.items() if name.startswith("frame.")}
-    core = {name.removeprefix("core."): array for name, array in tensors.items() if name.startswith("core.")}
-    return Surrogate(body, Frame(**frame), _CORES[card["architecture"]](core), card)
-
-
-def _read_card(path: Path) -> dict[str, Any]:
-    try:
-        card: dict[str, Any] = json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise TwinError(f"load.folder: expected a twin with {path.name} in {path.parent}, found none.") from error
-    except (ValueError, OSError) as error:
-        raise TwinError(f"load.folder: {path} cannot be read ({error}); is it truncated?") from error
-    if not isinstance(card, dict) or card.get("format") != FORMAT:
-        raise TwinError(f"load.folder: expected a card of format {FORMAT} in {path}.")
-    missing = [name for name in ("architecture", "body", "weights") if name not in card]
-    if missing or card["architecture"] not in _CORES:
-        raise TwinError(f"load.folder: {path} lacks {missing or 'a known architecture'}; was it edited?")
-    return card
-
-
-def _read_weights(path: Path, expected: str) -> dict[str, NDArray[Any]]:
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise TwinError(f"load.folder: the weights {path} cannot be read ({error}).") from error
-    if hashlib.sha256(content).hexdigest() != expected:
-        raise TwinError(
-            f"load.folder: {path} ({len(content)} bytes) is not the file its card names: truncated or changed. "
-            "Copy the twin again, or train it again."
-        )
-    try:
-        return load_tensors(content)
-    except SafetensorError as error:
-        raise TwinError(f"load.folder: {path} is no safetensors file ({error}).") from error

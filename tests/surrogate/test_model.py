@@ -13,14 +13,15 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.dataset import DataSet
 from softtwin.surrogate.domain import with_domain
-from softtwin.surrogate.predictor import CARD, WEIGHTS, Surrogate, TwinError, load, save
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.twin import CARD, WEIGHTS, TwinError, load, save
 
 STEPS = 0.5 ** np.arange(3, 8)
 
 
 def _direction(surrogate: Surrogate, seed: int, scale: float) -> np.ndarray:
     direction = np.zeros_like(surrogate.body.points)
-    loaded = surrogate.frame.loaded
+    loaded = surrogate.maps.loaded
     direction[loaded] = scale * np.random.default_rng(seed).standard_normal((len(loaded), 3))
     return direction
 
@@ -136,7 +137,7 @@ def test_extent_is_one_at_the_farthest_load_of_the_training(reduced: Surrogate, 
 
 
 def test_forces_where_none_were_trained_are_refused_by_name(surrogate: Surrogate) -> None:
-    inside = int(np.setdiff1d(surrogate.body.free, surrogate.frame.loaded)[0])
+    inside = int(np.setdiff1d(surrogate.body.free, surrogate.maps.loaded)[0])
     bad = np.zeros_like(surrogate.body.points)
     bad[inside, 1] = 1e-9
     with pytest.raises(ValueError, match=rf"1 other nodes, first \[{inside}\]"):

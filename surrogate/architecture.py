@@ -1,0 +1,114 @@
+"""What training and twins need of an architecture; the derivatives that every network has from torch.func."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, ClassVar, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from softtwin.reference.dataset import DataSet, Samples
+
+from .maps import LinearMaps
+
+
+class Linearisation(Protocol):
+    """A network at one point: its values and their derivative there."""
+
+    @property
+    def values(self) -> Tensor:
+        """(e,)."""
+
+    def push(self, tangents: Tensor) -> Tensor:
+        """Changes of the values, (e, k), for changes of the coordinates, (d, k)."""
+
+    def pull(self, cotangent: Tensor) -> Tensor:
+        """Gradient with respect to the coordinates, (d,), for one with respect to the values, (e,)."""
+
+
+class Network(nn.Module):
+    """Values (s, e) from coordinates (s, d), written once, for any precision and device.
+
+    Its derivatives come from torch.func, unless it brings its own because they were measured to pay.
+    """
+
+    def linearised(self, coordinates: Tensor) -> Linearisation:
+        """The network at one point, (d,)."""
+        return Differentiated(self, coordinates)
+
+
+class Differentiated:
+    """A network at one point, differentiated by torch.func.
+
+    Args:
+        network: values (s, e) from coordinates (s, d).
+        coordinates: the point, (d,).
+    """
+
+    def __init__(self, network: nn.Module, coordinates: Tensor) -> None:
+        self.network, self.coordinates = network, coordinates
+
+    @cached_property
+    def values(self) -> Tensor:
+        """(e,)."""
+        return self._value(self.coordinates)
+
+    def push(self, tangents: Tensor) -> Tensor:
+        """Changes of the values, (e, k), for changes of the coordinates, (d, k)."""
+
+        def one(tangent: Tensor) -> Tensor:
+            return torch.func.jvp(self._value, (self.coordinates,), (tangent,))[1]
+
+        return torch.func.vmap(one, in_dims=1, out_dims=1)(tangents)
+
+    def pull(self, cotangent: Tensor) -> Tensor:
+        """Gradient with respect to the coordinates, (d,), for one with respect to the values, (e,)."""
+        gradient: Tensor = torch.func.vjp(self._value, self.coordinates)[1](cotangent)[0]
+        return gradient
+
+    def _value(self, coordinates: Tensor) -> Tensor:
+        values: Tensor = self.network(coordinates[None])[0]
+        return values
+
+
+class Lesson(Protocol):
+    """A network in training, with its data: a module, since its data move to the device with it."""
+
+    network: nn.Module
+
+    @property
+    def sample_count(self) -> int:
+        """Number of training samples, images of them counted."""
+
+    def loss(self, batch: Tensor) -> Tensor:
+        """Loss over the samples with the given numbers, (s,)."""
+
+    def error(self) -> float:
+        """Error over the validation samples: the weights with the least are kept."""
+
+    def maps(self) -> LinearMaps:
+        """The linear maps around the network."""
+
+    def trained(self) -> Network:
+        """The network that predicts, with the weights as they are now."""
+
+
+class Architecture(Protocol):
+    """A kind of network with its settings: a frozen dataclass whose fields are its part of the configuration."""
+
+    name: ClassVar[str]
+    rate: ClassVar[float]
+    """Learning rate, where a plan says none."""
+    batch: ClassVar[int]
+    """Samples a step, where a plan says none."""
+    optimizer: ClassVar[Any]
+    """What `torch.optim` calls it."""
+
+    def lesson(self, data: DataSet, train: Samples, validation: Samples) -> Any:
+        """A `Lesson` with fresh weights."""
+
+    @staticmethod
+    def revived(tensors: Mapping[str, Tensor]) -> Network:
+        """The predicting network from what its `state_dict` was."""

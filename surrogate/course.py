@@ -1,0 +1,282 @@
+"""A training under Lightning: rounds, the clock, the learning rate, a progress bar, checkpoints."""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from torch import Tensor
+from tqdm import tqdm
+
+from .plan import TrainingPlan
+
+ROUNDS = 40  # a round ends with a look at the validation split and a checkpoint
+_WARM_UP = 200  # steps over which the learning rate rises
+_WARM_TENTHS = 10.0
+_ENDLESS = 10**9  # steps of a round that the clock ends
+
+
+class Diverged(RuntimeError):  # noqa: N818 - a way to end, as NotConverged is
+    """Training whose validation error is no finite number any more: the message says what to try."""
+
+
+def device() -> str:
+    """Where to train."""
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _count_steps(plan: TrainingPlan, sample_count: int) -> int | None:
+    """Steps of a training by epochs, a multiple of the steps of a round; None where the clock ends it."""
+    if plan.epochs is None:
+        return None
+    wanted = math.ceil(plan.epochs * sample_count / plan.batch_size(sample_count))
+    rounds = min(ROUNDS, wanted)
+    return math.ceil(wanted / rounds) * rounds
+
+
+def rate_factor(step: int, share: float) -> float:
+    """Part of the highest learning rate: a warm-up, then a cosine down to zero at the end of the budget.
+
+    Args:
+        step: steps that were made.
+        share: part of the epochs or seconds that were used, 0 to 1.
+    """
+    warm = max((step + 1) / _WARM_UP, _WARM_TENTHS * share)  # 200 steps, or a tenth of a training that is shorter
+    return min(1.0, warm) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, share)))
+
+
+@dataclass(frozen=True)
+class Batches:
+    """Sample numbers of each step of a round, shuffled passes one after the other: a loader without workers.
+
+    Args:
+        count: number of samples.
+        batch: samples a step.
+        steps: steps of the round.
+        seed: seed of the training.
+        number: number of the round; with the seed it decides the order.
+    """
+
+    count: int
+    batch: int
+    steps: int
+    seed: int
+    number: int
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def __iter__(self) -> Iterator[Tensor]:
+        rng = np.random.default_rng([self.seed, self.number])
+        waiting = np.empty(0, dtype=np.int64)
+        for _ in range(self.steps):
+            while len(waiting) < self.batch:
+                waiting = np.concatenate([waiting, rng.permutation(self.count)])
+            yield torch.from_numpy(waiting[: self.batch])
+            waiting = waiting[self.batch :]
+
+
+class Course(lightning.LightningModule):
+    """A lesson under Lightning: one epoch is a round; the best weights on the validation split are kept.
+
+    A round is a part of the steps, or of the time by the clock; it holds at least one step.
+
+    Args:
+        lesson: network, data and loss.
+        plan: how to train.
+        mark: fingerprint of the data.
+        clock: seconds since whenever.
+    """
+
+    def __init__(self, lesson: Any, plan: TrainingPlan, mark: str, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self.lesson = lesson
+        self.plan, self.mark, self.clock = plan, mark, clock
+        self.steps = _count_steps(plan, lesson.sample_count)
+        self.rounds = ROUNDS if self.steps is None else min(ROUNDS, self.steps)
+        self.best: dict[str, Tensor] = {}
+        self.best_error = math.inf
+        self.seconds = 0.0
+        self.steps_made = 0
+
+    @property
+    def share(self) -> float:
+        """Part of the epochs or seconds that were used, as far as the clock was looked at."""
+        return self.seconds / self.plan.seconds if self.steps is None else self.steps_made / self.steps
+
+    def configure_optimizers(self) -> Any:
+        """The architecture's; its rate is set before every step."""
+        architecture, weights = self.plan.architecture, self.lesson.network.parameters()
+        return architecture.optimizer(weights, lr=self.plan.rate, fused=True)
+
+    def train_dataloader(self) -> Batches:
+        """Sample numbers of the steps of the current round."""
+        count = self.lesson.sample_count
+        steps = _ENDLESS if self.steps is None else self.steps // self.rounds
+        return Batches(count, self.plan.batch_size(count), steps, self.plan.seed, self.current_epoch)
+
+    def on_train_start(self) -> None:
+        """Start the clock, where an interrupted training left it."""
+        self._origin = self.clock() - self.seconds
+
+    def on_train_epoch_start(self) -> None:
+        """Find where the round ends: at the next part of the time; batches end the others."""
+        self._round_end = math.inf if self.steps is not None else (math.floor(ROUNDS * self.share) + 1) / ROUNDS
+
+    def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> int | None:
+        """Look at the clock: -1 ends the round, else the step gets its learning rate."""
+        self._look()
+        over = self.share >= 1.0 and self.steps_made > 0
+        if over or (batch_idx > 0 and self.share >= self._round_end):
+            return -1
+        for group in self.trainer.optimizers[0].param_groups:
+            group["lr"] = self.plan.rate * rate_factor(self.steps_made, self.share)
+        return None
+
+    def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
+        """Loss of one batch."""
+        return self.lesson.loss(batch)
+
+    def on_train_epoch_end(self) -> None:
+        """Look at the validation split and keep the weights if they are the best so far."""
+        error = self.lesson.error()
+        self._look()
+        if not math.isfinite(error):
+            raise Diverged(
+                f"train: the validation error is {error} after {self.steps_made} steps at learning rate "
+                f"{self.plan.rate}; lower TrainingPlan.learning_rate."
+            )
+        if error < self.best_error:
+            self.best_error = error
+            self.best = {name: value.detach().clone() for name, value in self.lesson.network.state_dict().items()}
+        if self.share >= 1.0:
+            self.trainer.should_stop = True
+
+    def _look(self) -> None:
+        self.seconds = self.clock() - self._origin
+        self.steps_made = self.trainer.global_step
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add what Lightning does not know of."""
+        checkpoint["course"] = {
+            "plan": self.plan.entries(),
+            "data": self.mark,
+            "steps_made": self.steps_made,
+            "best": self.best,
+            "best_error": self.best_error,
+            "seconds": self.seconds,
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take it back."""
+        self.take_back(checkpoint["course"])
+
+    def take_back(self, course: dict[str, Any]) -> None:
+        """Go on from what `on_save_checkpoint` added."""
+        for name in ("best", "best_error", "seconds", "steps_made"):
+            setattr(self, name, course[name])
+
+
+class _Progress(Callback):
+    """One bar over the steps or the seconds: time left, validation error; quiet when not a terminal."""
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: Any) -> None:
+        by_clock = pl_module.steps is None
+        layout = "{desc}: {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s{postfix}" if by_clock else None
+        total = pl_module.plan.seconds if by_clock else pl_module.steps
+        self._bar = tqdm(total=total, desc="training", unit="step", bar_format=layout, disable=None)
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, pl_module: Any, *_: Any) -> None:
+        used = trainer.global_step if pl_module.steps is not None else min(pl_module.seconds, self._bar.total or 0.0)
+        self._bar.update(used - self._bar.n)
+
+    def on_train_epoch_start(self, trainer: lightning.Trainer, pl_module: Any) -> None:
+        if pl_module.best:
+            said = f", step {trainer.global_step}, validation {pl_module.best_error:.3g}"
+            self._bar.set_postfix_str(said, refresh=False)
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module: Any) -> None:
+        self._bar.close()
+
+    def on_exception(self, trainer: lightning.Trainer, pl_module: Any, exception: BaseException) -> None:
+        if hasattr(self, "_bar"):
+            self._bar.close()
+
+
+def fit(course: Course, path: Path, resume: bool) -> None:
+    """Train to the end of the plan; every round leaves a checkpoint.
+
+    Args:
+        course: what to train.
+        path: of the checkpoint.
+        resume: go on from it.
+    """
+    with _quiet(), _interruptible():
+        keeper = ModelCheckpoint(
+            dirpath=path.parent,
+            filename=path.stem,
+            save_on_train_epoch_end=True,
+            enable_version_counter=False,
+        )
+        trainer = lightning.Trainer(
+            accelerator="gpu" if device() == "cuda" else "cpu",
+            devices=1,
+            plugins=LightningEnvironment(),  # else it looks for MPI and starts it
+            max_epochs=course.rounds,
+            reload_dataloaders_every_n_epochs=1,
+            callbacks=[keeper, _Progress()],
+            logger=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            default_root_dir=path.parent,
+        )
+        trainer.fit(course, ckpt_path=path if resume else None)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Lightning's advice: its hints on hardware, loaders and folders are no concern of the user here."""
+    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric", "lightning")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
+            warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated", category=FutureWarning)
+            warnings.filterwarnings("ignore", category=UserWarning, module=r"lightning\.")
+            warnings.filterwarnings("ignore", category=DeprecationWarning, module=r"lightning\.")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C stays a KeyboardInterrupt: Lightning turns it into an exit and leaves the signal ignored."""
+    main = threading.current_thread() is threading.main_thread()
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    except SystemExit as error:
+        if isinstance(error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        if main:
+            signal.signal(signal.SIGINT, handler)

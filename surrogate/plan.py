@@ -1,0 +1,66 @@
+"""What to train, and how long."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from .architecture import Architecture
+from .reduced import Reduced
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """What to train, and how long.
+
+    Args:
+        architecture: the kind of network with its settings.
+        seconds: wall time of the steps, the looks at the validation split and the checkpoints together. The clock is
+            looked at before every step, so that training ends with the step that is under way when the time is over,
+            on a busy machine too (with fewer steps then). Reading the data and finding the modes come before it.
+        epochs: passes over the training samples; given, it replaces `seconds`.
+        batch: samples a step; None for the architecture's own.
+        learning_rate: highest of the cosine; None for the architecture's own.
+        samples: draws of the training split to use; None for all.
+        seed: seed of weights and batches.
+
+    Raises:
+        ValueError: an argument out of its range.
+    """
+
+    architecture: Architecture = field(default_factory=Reduced)
+    seconds: float = 60.0
+    epochs: int | None = None
+    batch: int | None = None
+    learning_rate: float | None = None
+    samples: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "batch", "samples"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"TrainingPlan.{name}: expected at least 1, got {value}.")
+        for name in ("seconds", "learning_rate"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < math.inf:
+                raise ValueError(f"TrainingPlan.{name}: expected a positive number, got {value}.")
+
+    @property
+    def rate(self) -> float:
+        """Highest learning rate."""
+        return self.learning_rate or self.architecture.rate
+
+    def batch_size(self, count: int) -> int:
+        """Samples a step when there are so many."""
+        return min(self.batch or self.architecture.batch, count)
+
+    def entries(self) -> dict[str, Any]:
+        """All settings by name, those of the architecture among them, for cards and checkpoints."""
+        kind = self.architecture
+        return {"architecture": kind.name, **_settings(kind), **_settings(self, "architecture")}
+
+
+def _settings(plan: Any, *apart: str) -> dict[str, Any]:
+    return {one.name: getattr(plan, one.name) for one in fields(plan) if one.name not in apart}

@@ -1,0 +1,9 @@
+"""The architectures by name: a new one is a file of its own, and a word here."""
+
+from __future__ import annotations
+
+from .architecture import Architecture
+from .mlp import Perceptron
+from .reduced import Reduced
+
+ARCHITECTURES: dict[str, type[Architecture]] = {kind.name: kind for kind in (Reduced, Perceptron)}

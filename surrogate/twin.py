@@ -1,0 +1,119 @@
+"""A surrogate in a folder, enough to predict on another machine: weights (safetensors) and card (JSON)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+
+from softtwin.meshes.body import Body
+
+from .maps import LinearMaps
+from .model import Surrogate
+from .registry import ARCHITECTURES
+
+WEIGHTS = "surrogate.safetensors"
+CARD = "surrogate.json"
+FORMAT = 1
+_MAPS, _NETWORK = "frame.", "core."  # what their tensors' names begin with
+NOTICE = "Research software, not a medical device: not for diagnosis or treatment."
+
+
+class TwinError(ValueError):
+    """A twin that cannot be used: missing, truncated, changed, or of another body."""
+
+
+def save(surrogate: Surrogate, folder: Path | str) -> None:
+    """Write weights (safetensors) and card (JSON) into a folder; the body is written apart, with `meshes.files`.
+
+    Args:
+        surrogate: what to save.
+        folder: made if it is not there; files of the same names are replaced.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {f"{_MAPS}{name}": array for name, array in surrogate.maps.arrays().items()}
+    tensors |= {f"{_NETWORK}{name}": tensor.numpy() for name, tensor in surrogate.network.state_dict().items()}
+    weights = save_tensors({name: np.ascontiguousarray(array) for name, array in tensors.items()})
+    card = {
+        **surrogate.card,
+        "format": FORMAT,
+        "body": surrogate.body.fingerprint,
+        "weights": hashlib.sha256(weights).hexdigest(),
+        "notice": NOTICE,
+    }
+    _replace(folder / WEIGHTS, weights)
+    _replace(folder / CARD, json.dumps(card, indent=2, allow_nan=False).encode())
+
+
+def _replace(path: Path, content: bytes) -> None:
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(content)
+    os.replace(partial, path)
+
+
+def load(folder: Path | str, body: Body) -> Surrogate:
+    """The surrogate saved in a folder.
+
+    Args:
+        folder: where `save` wrote it.
+        body: the body it was trained on.
+
+    Raises:
+        TwinError: files missing, truncated or changed, another format, or another body.
+    """
+    folder = Path(folder)
+    card = _read_card(folder / CARD)
+    if card["body"] != body.fingerprint:
+        raise TwinError(
+            f"load.body: the twin in {folder} belongs to another body (fingerprint {card['body'][:12]}..., "
+            f"got {body.fingerprint[:12]}...); nodes, cells and fixed nodes must be those it was trained on."
+        )
+    tensors = _read_weights(folder / WEIGHTS, card["weights"])
+    maps = {name.removeprefix(_MAPS): array for name, array in tensors.items() if name.startswith(_MAPS)}
+    weights = {
+        name.removeprefix(_NETWORK): torch.tensor(array) for name, array in tensors.items() if name.startswith(_NETWORK)
+    }
+    with torch.random.fork_rng(devices=[]):  # the weights are given: the caller's chance is left alone
+        network = ARCHITECTURES[card["architecture"]].revived(weights)
+    return Surrogate(body, LinearMaps(**maps), network, card)
+
+
+def _read_card(path: Path) -> dict[str, Any]:
+    try:
+        card: dict[str, Any] = json.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise TwinError(f"load.folder: expected a twin with {path.name} in {path.parent}, found none.") from error
+    except (ValueError, OSError) as error:
+        raise TwinError(f"load.folder: {path} cannot be read ({error}); is it truncated?") from error
+    if not isinstance(card, dict) or card.get("format") != FORMAT:
+        raise TwinError(f"load.folder: expected a card of format {FORMAT} in {path}.")
+    missing = [name for name in ("architecture", "body", "weights") if name not in card]
+    if missing or card["architecture"] not in ARCHITECTURES:
+        raise TwinError(f"load.folder: {path} lacks {missing or 'a known architecture'}; was it edited?")
+    return card
+
+
+def _read_weights(path: Path, expected: str) -> dict[str, NDArray[Any]]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise TwinError(f"load.folder: the weights {path} cannot be read ({error}).") from error
+    if hashlib.sha256(content).hexdigest() != expected:
+        raise TwinError(
+            f"load.folder: {path} ({len(content)} bytes) is not the file its card names: truncated or changed. "
+            "Copy the twin again, or train it again."
+        )
+    try:
+        return load_tensors(content)
+    except SafetensorError as error:
+        raise TwinError(f"load.folder: {path} is no safetensors file ({error}).") from error

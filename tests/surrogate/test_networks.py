@@ -1,0 +1,109 @@
+"""Every network: derivatives by hand against torch.func, what is saved, other precisions."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from softtwin.reference.dataset import DataSet
+from softtwin.surrogate.architecture import Architecture, Differentiated, Network
+from softtwin.surrogate.mlp import Perceptron
+from softtwin.surrogate.reduced import AveragedNetwork, Reduced
+from softtwin.surrogate.registry import ARCHITECTURES
+
+SETTINGS: dict[str, Architecture] = {
+    "reduced": Reduced(modes=6, width=24, depth=2),
+    "reduced, no symmetries": Reduced(modes=6, width=24, depth=2, symmetries=False),
+    "mlp": Perceptron(),
+    "mlp, 20 wide": Perceptron(width=20),
+}
+
+
+@pytest.fixture(scope="module", params=list(SETTINGS))
+def lesson(request: pytest.FixtureRequest, data: DataSet) -> Any:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        samples = data.samples("train")
+        return SETTINGS[request.param].lesson(data, samples, samples)
+
+
+@pytest.fixture(scope="module")
+def network(lesson: Any) -> Network:
+    return lesson.trained()
+
+
+@pytest.fixture
+def point(lesson: Any, data: DataSet) -> torch.Tensor:
+    """The coordinates of a sample's load."""
+    return torch.from_numpy(lesson.maps().encode @ data.samples("test").forces[1].ravel())
+
+
+def _drawn(*shape: int) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(3).standard_normal(shape))
+
+
+def test_every_architecture_is_in_this_suite() -> None:
+    assert {settings.name for settings in SETTINGS.values()} == set(ARCHITECTURES)
+
+
+def test_values_and_derivatives_are_those_of_torch_func(network: Network, point: torch.Tensor) -> None:
+    own, expected = network.linearised(point), Differentiated(network, point)
+    tangents, cotangent = _drawn(len(point), 5) * point.abs().max(), _drawn(len(own.values))
+    for found, known in (
+        (own.values, expected.values),
+        (own.push(tangents), expected.push(tangents)),
+        (own.pull(cotangent), expected.pull(cotangent)),
+    ):
+        assert known.abs().max() > 0.0
+        assert (found - known).abs().max() < 1e-12 * known.abs().max()
+
+
+def test_derivatives_are_those_of_differences(network: Network, point: torch.Tensor) -> None:
+    tangent = _drawn(len(point), 1) * point.abs().max()
+    step = 1e-6
+    ahead, behind = (network((point + sign * step * tangent[:, 0])[None])[0] for sign in (1.0, -1.0))
+    pushed = network.linearised(point).push(tangent)[:, 0]
+    # the step's square, and round-off over the step
+    assert ((ahead - behind) / (2.0 * step) - pushed).abs().max() < 1e-7 * pushed.abs().max()
+
+
+def test_a_batch_is_its_points(network: Network, point: torch.Tensor) -> None:
+    batch = torch.stack([point, -0.5 * point, 0.1 * point])
+    apart = torch.stack([network.linearised(each).values for each in batch])
+    assert (network(batch) - apart).abs().max() < 1e-13 * apart.abs().max()
+
+
+def test_what_is_saved_is_the_network(request: pytest.FixtureRequest, network: Network, point: torch.Tensor) -> None:
+    settings = SETTINGS[request.node.callspec.params["lesson"]]
+    revived = settings.revived({name: tensor.clone() for name, tensor in network.state_dict().items()})
+    assert not any(weights.requires_grad for weights in revived.parameters())
+    assert torch.equal(revived.linearised(point).values, network.linearised(point).values)
+
+
+def test_single_precision_is_good_to_a_millionth(network: Network, point: torch.Tensor) -> None:
+    tangents = _drawn(len(point), 3)
+    double, single = network.linearised(point), copy.deepcopy(network).float().linearised(point.float())
+    assert single.values.dtype == torch.float32
+    assert (single.values - double.values).abs().max() < 3e-6 * double.values.abs().max()
+    pushed = double.push(tangents)
+    assert (single.push(tangents.float()) - pushed).abs().max() < 1e-5 * pushed.abs().max()
+
+
+def test_what_is_trained_is_what_predicts(lesson: Any, data: DataSet) -> None:
+    """The linear maps around the trained network give what the network in training gives."""
+    forces = data.samples("train").forces[0].ravel()
+    maps, network = lesson.maps(), lesson.trained()
+    inner = maps.decode @ network.linearised(torch.from_numpy(maps.encode @ forces)).values.numpy() + maps.offset
+    with torch.no_grad():
+        if isinstance(network, AveragedNetwork):
+            images = [
+                lesson.network((turn.float() @ lesson.loads[0])[None])[0] @ turn.float() for turn in network.turns
+            ]
+            expected = maps.decode @ torch.stack(images).mean(dim=0).double().numpy()
+        else:
+            expected = lesson.displacement_scale * lesson.network(lesson.forces[:1])[0].double().numpy()
+    assert np.abs(inner - expected).max() < 1e-5 * np.abs(expected).max()
