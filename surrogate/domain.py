@@ -25,7 +25,7 @@ def with_domain(surrogate: Surrogate, data: DataSet) -> Surrogate:
         data: the data set that it was trained on.
     """
     samples = data.samples("train")
-    coordinates = samples.forces.reshape(len(samples), -1) @ surrogate.maps.encode.T
+    coordinates = surrogate.maps.encoded(samples.forces.reshape(len(samples), -1).T).T
     spread = np.sqrt((coordinates**2).mean(axis=0))
     spread = np.maximum(spread, _LEAST_SPREAD * spread.max())
     reach = np.sqrt(((coordinates / spread) ** 2).mean(axis=1)).max()

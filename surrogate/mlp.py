@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from softtwin.reference.dataset import DataSet, Samples
 
 from .architecture import Network
-from .maps import LinearMaps
+from .maps import LinearMaps, no_response
+from .scaled import ScaledLesson
 
 Floats = NDArray[np.float64]
 
@@ -117,11 +118,8 @@ class PerceptronNetwork(nn.Module):
         return values
 
 
-class PerceptronLesson(nn.Module):
-    """The perceptron with its training data; the loss is the mean squared error of scaled displacements.
-
-    Forces and displacements are divided by one data scale factor each, the root mean square over the training split.
-    Inputs that are zero in every sample are left out, which changes nothing.
+class PerceptronLesson(ScaledLesson):
+    """The perceptron with its training data.
 
     Args:
         data: the data set, for its loaded nodes.
@@ -130,56 +128,25 @@ class PerceptronLesson(nn.Module):
         settings: of the network.
     """
 
-    forces: Tensor
-    displacements: Tensor
-    validation_forces: Tensor
-    validation_displacements: Tensor
+    network: PerceptronNetwork
 
     def __init__(self, data: DataSet, train: Samples, validation: Samples, settings: Perceptron) -> None:
-        super().__init__()
-        self.loaded = data.response.loaded
-        self.force_scale = _root_mean_square(train.forces)
-        self.displacement_scale = _root_mean_square(train.displacements)
-        for name, samples in (("", train), ("validation_", validation)):
-            self._store(f"{name}forces", samples.forces / self.force_scale)
-            self._store(f"{name}displacements", samples.displacements / self.displacement_scale)
+        super().__init__(data, train, validation)
         inputs, outputs = self.forces.shape[1], train.displacements[0].size
         self.network = PerceptronNetwork(inputs, settings.width or outputs, outputs)
-
-    @property
-    def sample_count(self) -> int:
-        """Number of training samples."""
-        return len(self.forces)
-
-    def loss(self, batch: Tensor) -> Tensor:
-        """Mean squared error over the samples with the given numbers."""
-        return nn.functional.mse_loss(self.network(self.forces[batch]), self.displacements[batch])
-
-    @torch.no_grad()
-    def error(self) -> float:
-        """Mean squared error over the validation samples."""
-        return float(nn.functional.mse_loss(self.network(self.validation_forces), self.validation_displacements))
 
     def maps(self) -> LinearMaps:
         """First matrix, last matrix and last bias, with the scale factors in them."""
         first, last = _array(self.network.enter.weight), _array(self.network.leave.weight)
-        scale, size = self.displacement_scale, len(last)
-        nothing = np.zeros((size, 0)), np.zeros((0, first.shape[1]))
+        scale = self.displacement_scale
         bias = scale * _array(self.network.leave.bias)
-        return LinearMaps(self.loaded, first / self.force_scale, scale * last, bias, *nothing)
+        nothing = no_response(len(last), first.shape[1])
+        return LinearMaps(self.loaded, bias, *nothing, encode=first / self.force_scale, decode=scale * last)
 
     def trained(self) -> Network:
         """The hidden layers as they are now in double precision."""
         return copy.deepcopy(self.network.inner).cpu().double().requires_grad_(False)
 
-    def _store(self, name: str, fields: Floats) -> None:
-        flat = np.ascontiguousarray(fields.reshape(len(fields), -1), dtype=np.float32)
-        self.register_buffer(name, torch.from_numpy(flat), persistent=False)
-
 
 def _array(parameter: Tensor) -> Floats:
     return parameter.detach().double().cpu().numpy()
-
-
-def _root_mean_square(fields: Floats) -> float:
-    return max(float(np.sqrt((fields**2).mean())), 1e-300)

@@ -54,7 +54,7 @@ class SurrogateState:
         maps = surrogate.maps
         self._surrogate, self.coordinates = surrogate, coordinates
         self._inner = surrogate.network.linearised(torch.from_numpy(coordinates))
-        self.displacement: Floats = (maps.offset + linear + maps.decode @ self._inner.values.numpy()).reshape(-1, 3)
+        self.displacement: Floats = (maps.offset + linear + maps.decoded(self._inner.values.numpy())).reshape(-1, 3)
 
     @property
     def extent(self) -> float | None:
@@ -77,7 +77,7 @@ class SurrogateState:
         """
         maps = self._surrogate.maps
         columns = self._surrogate.at_loaded("changes", changes)
-        return maps.linear(columns) + maps.decode @ tangent(self._inner, maps.encode @ columns)
+        return maps.linear(columns) + maps.decoded(tangent(self._inner, maps.encoded(columns)))
 
     def pull(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3): J^T g, zero at nodes that never carry load.
@@ -94,8 +94,8 @@ class SurrogateState:
         maps = self._surrogate.maps
         flat = checked_array("SurrogateState.cotangent", given, shape).ravel()
         gradient = np.zeros_like(flat)
-        inner = self._inner.pull(torch.from_numpy(flat @ maps.decode)).numpy()
-        gradient[self._surrogate.rows] = maps.linear_adjoint(flat) + inner @ maps.encode
+        inner = self._inner.pull(torch.from_numpy(maps.decoded_adjoint(flat))).numpy()
+        gradient[self._surrogate.rows] = maps.linear_adjoint(flat) + maps.encoded_adjoint(inner)
         return gradient.reshape(-1, 3)
 
 
@@ -151,7 +151,7 @@ class Surrogate:
         load = checked_array("Surrogate.forces", forces, self.body.points.shape)
         self._refuse_idle("forces", np.abs(load).max(axis=1))
         loads = load.ravel()[self.rows]
-        return SurrogateState(self, self.maps.encode @ loads, self.maps.linear(loads))
+        return SurrogateState(self, self.maps.encoded(loads), self.maps.linear(loads))
 
     def reduced(self, nodes: ArrayLike, basis: ArrayLike) -> ReducedSurrogate:
         """The surrogate between a few force coefficients and a few nodes, all that can be computed before computed.
@@ -229,7 +229,9 @@ class ReducedSurrogateState:
         self.model, self.coefficients = model, coefficients
         coordinates = (model.encode @ coefficients).astype(np.float32)
         self._inner = model.surrogate.single.linearised(torch.from_numpy(coordinates))
-        moved = model.offset_rows + model.rows @ np.concatenate([coefficients, self._inner.values.numpy()])
+        moved = model.offset_rows + model.rows @ np.concatenate(
+            [coefficients, self._inner.values.numpy()[model.wanted]]
+        )
         self.positions: Floats = moved.reshape(-1, 3)
 
     @cached_property
@@ -241,7 +243,7 @@ class ReducedSurrogateState:
 
     @cached_property
     def _tangent(self) -> Floats:
-        return tangent(self._inner, self.model.encode)
+        return tangent(self._inner, self.model.encode)[self.model.wanted]
 
     def jacobian(self, rows: csr_array) -> Floats:
         """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p); no more is touched."""
@@ -272,8 +274,10 @@ class ReducedSurrogate:
         maps = surrogate.maps
         picked = (3 * nodes[:, None] + np.arange(3)).ravel()
         self.surrogate, self._basis, self._combination = surrogate, basis, np.eye(basis.shape[1])
-        self.encode = maps.encode @ basis
-        self._linear_rows, self._decode_rows = surrogate.linear_rows(picked, basis), maps.decode[picked]
+        self.encode = maps.encoded(basis)
+        self._linear_rows = surrogate.linear_rows(picked, basis)
+        self.wanted = picked if maps.decode is None else slice(None)  # of the network's values
+        self._decode_rows = np.eye(len(picked)) if maps.decode is None else maps.decode[picked]
         self.rows = np.hstack(
             [self._linear_rows, self._decode_rows]
         )  # by the coefficients and by what the network says

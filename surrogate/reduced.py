@@ -295,7 +295,7 @@ class ReducedLesson(nn.Module):
         """The linear response, and the modes on both sides of the network."""
         encode = np.ascontiguousarray(self.basis.restricted.T)
         left, right = response_parts(self.response)
-        return LinearMaps(self.response.loaded, encode, self.basis.modes, np.zeros(len(left)), left, right)
+        return LinearMaps(self.response.loaded, np.zeros(len(left)), left, right, encode, self.basis.modes)
 
     def trained(self) -> AveragedNetwork:
         """The network as it is now in double precision, averaged over the symmetries."""

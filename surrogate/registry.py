@@ -5,5 +5,6 @@ from __future__ import annotations
 from .architecture import Architecture
 from .mlp import Perceptron
 from .reduced import Reduced
+from .umesh import UMesh
 
-ARCHITECTURES: dict[str, type[Architecture]] = {kind.name: kind for kind in (Reduced, Perceptron)}
+ARCHITECTURES: dict[str, type[Architecture]] = {kind.name: kind for kind in (Reduced, Perceptron, UMesh)}

@@ -79,7 +79,9 @@ def load(folder: Path | str, body: Body) -> Surrogate:
             f"got {body.fingerprint[:12]}...); nodes, cells and fixed nodes must be those it was trained on."
         )
     tensors = _read_weights(folder / WEIGHTS, card["weights"])
-    maps = {name.removeprefix(_MAPS): array for name, array in tensors.items() if name.startswith(_MAPS)}
+    maps: dict[str, Any] = {
+        name.removeprefix(_MAPS): array for name, array in tensors.items() if name.startswith(_MAPS)
+    }
     weights = {
         name.removeprefix(_NETWORK): torch.tensor(array) for name, array in tensors.items() if name.startswith(_NETWORK)
     }

@@ -23,6 +23,7 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
+from softtwin.surrogate.umesh import UMesh
 
 Floats = NDArray[np.float64]
 
@@ -147,7 +148,12 @@ def perceptron(data: DataSet) -> Surrogate:
     return train(data, TrainingPlan(Perceptron(), batch=32, epochs=30))
 
 
-@pytest.fixture(params=["reduced", "perceptron"])
+@pytest.fixture(scope="session")
+def umesh(data: DataSet) -> Surrogate:
+    return train(data, TrainingPlan(UMesh(channels=8, levels=2), batch=16, epochs=10))
+
+
+@pytest.fixture(params=["reduced", "perceptron", "umesh"])
 def surrogate(request: pytest.FixtureRequest) -> Surrogate:
     model: Surrogate = request.getfixturevalue(request.param)
     return model

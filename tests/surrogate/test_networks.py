@@ -14,12 +14,15 @@ from softtwin.surrogate.architecture import Architecture, Differentiated, Networ
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.reduced import AveragedNetwork, Reduced
 from softtwin.surrogate.registry import ARCHITECTURES
+from softtwin.surrogate.umesh import UMesh
 
 SETTINGS: dict[str, Architecture] = {
     "reduced": Reduced(modes=6, width=24, depth=2),
     "reduced, no symmetries": Reduced(modes=6, width=24, depth=2, symmetries=False),
     "mlp": Perceptron(),
     "mlp, 20 wide": Perceptron(width=20),
+    "umesh": UMesh(channels=4, levels=2),
+    "umesh, numbered along the long axis": UMesh(channels=4, levels=1, numbering="long"),
 }
 
 
@@ -39,7 +42,7 @@ def network(lesson: Any) -> Network:
 @pytest.fixture
 def point(lesson: Any, data: DataSet) -> torch.Tensor:
     """The coordinates of a sample's load."""
-    return torch.from_numpy(lesson.maps().encode @ data.samples("test").forces[1].ravel())
+    return torch.from_numpy(lesson.maps().encoded(data.samples("test").forces[1].ravel()))
 
 
 def _drawn(*shape: int) -> torch.Tensor:
@@ -97,7 +100,8 @@ def test_what_is_trained_is_what_predicts(lesson: Any, data: DataSet) -> None:
     """The linear maps around the trained network give what the network in training gives."""
     forces = data.samples("train").forces[0].ravel()
     maps, network = lesson.maps(), lesson.trained()
-    inner = maps.decode @ network.linearised(torch.from_numpy(maps.encode @ forces)).values.numpy() + maps.offset
+    values = network.linearised(torch.from_numpy(maps.encoded(forces))).values.numpy()
+    inner = maps.decoded(values) + maps.offset
     with torch.no_grad():
         if isinstance(network, AveragedNetwork):
             images = [
