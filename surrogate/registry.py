@@ -5,6 +5,7 @@ from __future__ import annotations
 from .architecture import Architecture
 from .mlp import Perceptron
 from .reduced import Reduced
+from .transolver import Transolver
 from .umesh import UMesh
 
-ARCHITECTURES: dict[str, type[Architecture]] = {kind.name: kind for kind in (Reduced, Perceptron, UMesh)}
+ARCHITECTURES: dict[str, type[Architecture]] = {kind.name: kind for kind in (Reduced, Perceptron, UMesh, Transolver)}

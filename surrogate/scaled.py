@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from softtwin.reference.dataset import DataSet, Samples
+
+from .architecture import Network
+from .maps import LinearMaps, no_response
 
 Floats = NDArray[np.float64]
 
@@ -60,6 +65,58 @@ class ScaledLesson(nn.Module):
     def _store(self, name: str, fields: Floats) -> None:
         flat = np.ascontiguousarray(fields.reshape(len(fields), -1), dtype=np.float32)
         self.register_buffer(name, torch.from_numpy(flat), persistent=False)
+
+
+class FieldNetwork(Network):
+    """A network from forces at the loaded nodes, (s, 3l), to the displacement of all nodes, (s, 3n).
+
+    Its scale factors are 1 in training, whose samples are scaled.
+
+    Args:
+        entries: numbers of the loaded nodes, (l,).
+    """
+
+    entries: Tensor
+    input_scale: Tensor
+    output_scale: Tensor
+
+    def __init__(self, entries: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("entries", entries)
+        self.register_buffer("input_scale", torch.ones(()))
+        self.register_buffer("output_scale", torch.ones(()))
+
+    def forward(self, coordinates: Tensor) -> Tensor:
+        """Displacements for forces."""
+        forces = (coordinates * self.input_scale).unflatten(1, (-1, 3))
+        return self.moved(forces).flatten(1) * self.output_scale
+
+    def moved(self, forces: Tensor) -> Tensor:
+        """Displacement of all nodes, (s, n, 3), for forces at the loaded ones, (s, l, 3), both scaled."""
+        raise NotImplementedError
+
+
+class FieldLesson(ScaledLesson):
+    """Scaled samples with a network between whole fields."""
+
+    network: FieldNetwork
+
+    @property
+    def entries(self) -> Tensor:
+        """Numbers of the loaded nodes, (l,)."""
+        return torch.from_numpy(np.asarray(self.loaded, dtype=np.int64))
+
+    def maps(self) -> LinearMaps:
+        """None: the network takes forces and gives displacements."""
+        size, inputs = self.displacements.shape[1], self.forces.shape[1]
+        return LinearMaps(self.loaded, np.zeros(size), *no_response(size, inputs))
+
+    def trained(self) -> FieldNetwork:
+        """The network as it is now in double precision, with the scale factors in it."""
+        network = copy.deepcopy(self.network).cpu().double().requires_grad_(False)
+        network.input_scale.fill_(1.0 / self.force_scale)
+        network.output_scale.fill_(self.displacement_scale)
+        return network
 
 
 def _root_mean_square(fields: Floats) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -15,9 +14,7 @@ from torch import Tensor, nn
 from softtwin.meshes.body import Body
 from softtwin.reference.dataset import DataSet, Samples
 
-from .architecture import Network
-from .maps import LinearMaps, no_response
-from .scaled import ScaledLesson
+from .scaled import FieldLesson, FieldNetwork
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -111,8 +108,8 @@ def tensor_places(positions: Ints, shape: tuple[int, int, int], numbering: str) 
     return np.stack(np.unravel_index(numbers, shape), axis=1)
 
 
-class UMeshNetwork(Network):
-    """Displacements of all nodes, (s, 3n), from forces at the loaded nodes, (s, 3l).
+class UMeshNetwork(FieldNetwork):
+    """A U-Net on the grid that holds the nodes.
 
     The grid is padded with zeros to a multiple of 2^levels. At each level two padded 3 x 3 x 3 convolutions, each with
     a ReLU; 2 x 2 x 2 max-pooling down, 2 x 2 x 2 transposed convolutions up; levels are joined by concatenation.
@@ -126,44 +123,38 @@ class UMeshNetwork(Network):
     """
 
     places: Tensor
-    entries: Tensor
     shape: Tensor
-    input_scale: Tensor
-    output_scale: Tensor
+    numbers: Tensor
 
     def __init__(self, places: Tensor, entries: Tensor, shape: tuple[int, ...], channels: int, levels: int) -> None:
-        super().__init__()
+        super().__init__(entries)
         self.register_buffer("places", places)
-        self.register_buffer("entries", entries)
         self.register_buffer("shape", torch.tensor(shape))
-        self.register_buffer("input_scale", torch.ones(()))  # 1 in training, whose samples are scaled
-        self.register_buffer("output_scale", torch.ones(()))
         multiple = 2**levels
         self._padded = [-(-size // multiple) * multiple for size in shape]
         margins = [(padded - size) // 2 for padded, size in zip(self._padded, shape, strict=True)]
         x, y, z = (places + torch.tensor(margins)).T
-        self._numbers = (x * self._padded[1] + y) * self._padded[2] + z
+        numbers = (x * self._padded[1] + y) * self._padded[2] + z
+        self.register_buffer("numbers", numbers, persistent=False)
         widths = [channels * 2**level for level in range(levels + 1)]
         self.falls = nn.ModuleList(_two(a, b) for a, b in zip([3, *widths], widths, strict=False))
         self.rises = nn.ModuleList(nn.ConvTranspose3d(2 * a, a, 2, 2) for a in reversed(widths[:-1]))
         self.joins = nn.ModuleList(_two(2 * a, a) for a in reversed(widths[:-1]))
         self.leave = nn.Conv3d(channels, 3, 1)
 
-    def forward(self, coordinates: Tensor) -> Tensor:
-        """Displacements for forces."""
-        count = len(coordinates)
-        flat = coordinates.new_zeros(count, 3, int(np.prod(self._padded)))
-        numbers = self._numbers.to(coordinates.device)
-        forces = (coordinates * self.input_scale).reshape(count, -1, 3).mT
-        values = flat.index_copy(2, numbers[self.entries], forces).reshape(count, 3, *self._padded)
+    def moved(self, forces: Tensor) -> Tensor:
+        """Displacement of all nodes, (s, n, 3), for forces at the loaded ones, (s, l, 3), both scaled."""
+        count, numbers = len(forces), self.numbers
+        flat = forces.new_zeros(count, 3, int(np.prod(self._padded)))
+        values = flat.index_copy(2, numbers[self.entries], forces.mT).reshape(count, 3, *self._padded)
         passed = []
         for level, fall in enumerate(self.falls):
             values = fall(values if level == 0 else nn.functional.max_pool3d(values, 2))
             passed.append(values)
         for rise, join, beside in zip(self.rises, self.joins, reversed(passed[:-1]), strict=True):
             values = join(torch.cat([beside, rise(values)], dim=1))
-        moved: Tensor = self.leave(values).flatten(2)[:, :, numbers].mT.reshape(count, -1)
-        return moved * self.output_scale
+        displacement: Tensor = self.leave(values).flatten(2)[:, :, numbers].mT
+        return displacement
 
 
 def _two(inputs: int, outputs: int) -> nn.Sequential:
@@ -172,7 +163,7 @@ def _two(inputs: int, outputs: int) -> nn.Sequential:
     )
 
 
-class UMeshLesson(ScaledLesson):
+class UMeshLesson(FieldLesson):
     """U-Mesh with its training data; the loss is that of the body's nodes alone, a masked loss.
 
     Args:
@@ -188,17 +179,4 @@ class UMeshLesson(ScaledLesson):
         super().__init__(data, train, validation)
         positions, shape = lattice(data.body)
         places = torch.from_numpy(tensor_places(positions, shape, settings.numbering))
-        entries = torch.from_numpy(np.asarray(self.loaded, dtype=np.int64))
-        self.network = UMeshNetwork(places, entries, shape, settings.channels, settings.levels)
-
-    def maps(self) -> LinearMaps:
-        """None: the network takes forces and gives displacements."""
-        size, inputs = self.displacements.shape[1], self.forces.shape[1]
-        return LinearMaps(self.loaded, np.zeros(size), *no_response(size, inputs))
-
-    def trained(self) -> UMeshNetwork:
-        """The network as it is now in double precision, with the scale factors in it."""
-        network = copy.deepcopy(self.network).cpu().double().requires_grad_(False)
-        network.input_scale.fill_(1.0 / self.force_scale)
-        network.output_scale.fill_(self.displacement_scale)
-        return network
+        self.network = UMeshNetwork(places, self.entries, shape, settings.channels, settings.levels)

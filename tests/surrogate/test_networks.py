@@ -14,6 +14,7 @@ from softtwin.surrogate.architecture import Architecture, Differentiated, Networ
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.reduced import AveragedNetwork, Reduced
 from softtwin.surrogate.registry import ARCHITECTURES
+from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
 
 SETTINGS: dict[str, Architecture] = {
@@ -21,6 +22,7 @@ SETTINGS: dict[str, Architecture] = {
     "reduced, no symmetries": Reduced(modes=6, width=24, depth=2, symmetries=False),
     "mlp": Perceptron(),
     "mlp, 20 wide": Perceptron(width=20),
+    "transolver": Transolver(width=16, depth=2, heads=2, slices=4),
     "umesh": UMesh(channels=4, levels=2),
     "umesh, numbered along the long axis": UMesh(channels=4, levels=1, numbering="long"),
 }

@@ -23,6 +23,7 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
+from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
 
 
@@ -74,8 +75,8 @@ def _stop_in_round(monkeypatch: pytest.MonkeyPatch, number: int, act: Any) -> No
 
 @pytest.mark.parametrize(
     "architecture",
-    [Reduced(width=32, symmetries=False), Perceptron(), UMesh(channels=32, levels=1)],
-    ids=["reduced", "mlp", "umesh"],
+    [Reduced(width=32, symmetries=False), Perceptron(), UMesh(channels=32, levels=1), Transolver()],
+    ids=["reduced", "mlp", "umesh", "transolver"],
 )
 def test_four_samples_are_learnt_by_heart(data: DataSet, tmp_path: Path, architecture: Architecture) -> None:
     plan = TrainingPlan(architecture, samples=4, epochs=240)
@@ -260,6 +261,8 @@ def test_plans_out_of_range_are_refused(change: dict[str, Any], message: str) ->
         (lambda: Reduced(modes=0), r"Reduced\.modes: expected at least 1, got 0"),
         (lambda: Reduced(sobolev=-0.1), r"Reduced\.sobolev: expected a number not below 0"),
         (lambda: Perceptron(width=0), r"Perceptron\.width: expected at least 1, got 0"),
+        (lambda: Transolver(heads=0), r"Transolver\.heads: expected at least 1, got 0"),
+        (lambda: Transolver(width=65), r"Transolver\.width: expected a multiple of 4 heads, got 65"),
     ],
 )
 def test_settings_of_a_network_out_of_range_are_refused(settings: Any, message: str) -> None:
