@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body, Surface
 
+from . import schema
+from .schema import Reason
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 FORMAT = 1
-
-# Why a draw was kept or kept apart; the numbers are what is stored.
-REASONS = {0: "accepted", 1: "not converged", 2: "unstable equilibrium", 3: "displacement beyond the wanted range"}
 
 
 class DataSetError(ValueError):
@@ -142,6 +142,11 @@ class DataSet:
         return self._array("modes/eigenvalues")
 
     @property
+    def sizes(self) -> schema.Sizes:
+        """What the shape of a sample depends on."""
+        return schema.Sizes(len(self.response.loaded), len(self.body.points), len(self.shapes))
+
+    @property
     def identity(self) -> str:
         """SHA-256 of the header and of the checksums of all blocks: another one, other samples."""
         digest = hashlib.sha256(json.dumps(self.header, sort_keys=True).encode())
@@ -190,7 +195,7 @@ class DataSet:
         kept = group["reason"][part] == 0
         return Samples(
             draws=np.arange(draws.start, draws.stop)[kept],
-            **{name: group[name][part][kept] for name in ("forces", "displacements", "probes", "adjoints")},
+            **{name: group[name][part][kept] for name in schema.FIELDS},
         )
 
     def rejected(self) -> Rejected:
@@ -201,14 +206,13 @@ class DataSet:
         draws = used[reasons[used] > 0]
         forces = group["forces"]
         stacked = np.stack([forces[int(i)] for i in draws]) if len(draws) else np.empty((0, *forces.shape[1:]))
-        return Rejected(draws, stacked, tuple(REASONS[int(reasons[i])] for i in draws))
+        return Rejected(draws, stacked, tuple(Reason(reasons[i]).words for i in draws))
 
     def figures(self, split: Split) -> dict[str, NDArray[Any]]:
         """What the solver said of each draw of a split: energy, residual, iterations, load steps, pivots, reason."""
         draws = self.split_draws(split)
         group = self._root["samples"]
-        names = ("energy", "residual", "iterations", "load_steps", "negative_pivots", "reason")
-        return {name: group[name][draws.start : draws.stop] for name in names}
+        return {name: group[name][draws.start : draws.stop] for name in schema.FIGURES}
 
     def _check_blocks(self, draws: range) -> None:
         size = self.header["block"]
@@ -231,7 +235,7 @@ class DataSet:
         size, group = self.header["block"], self._root["samples"]
         part = slice(block * size, (block + 1) * size)
         try:
-            arrays = {name: group[name][part] for name in _BLOCK_ARRAYS}
+            arrays = {name: group[name][part] for name in schema.NAMES}
         except Exception as error:  # a damaged chunk fails in whichever codec reads it
             return f"is damaged ({type(error).__name__})"
         return "" if checksum(arrays) == stored else "does not match its checksum: truncated or changed"
@@ -266,24 +270,12 @@ class DataSet:
 _BEYOND_REPAIR = (
     "truncated or changed. Bring a copy back, or make the whole data set again (`softtwin generate --again`)."
 )
-_BLOCK_ARRAYS = (
-    "forces",
-    "displacements",
-    "probes",
-    "adjoints",
-    "energy",
-    "residual",
-    "iterations",
-    "load_steps",
-    "negative_pivots",
-    "reason",
-)
 
 
 def checksum(arrays: Mapping[str, NDArray[Any]]) -> int:
     """CRC-32 of the arrays of a block, never 0 (0 stands for a block that is not there)."""
     value = 0
-    for name in _BLOCK_ARRAYS:
+    for name in schema.NAMES:
         value = zlib.crc32(np.ascontiguousarray(arrays[name]).tobytes(), value)
     return value or 1
 
@@ -319,30 +311,19 @@ def create(
     for name, values in arrays.items():
         root.create_array(name, data=values)
     checksums = {name: zlib.crc32(values.tobytes()) for name, values in arrays.items()}
-    _create_samples(root, header, len(response.loaded), len(body.points), len(shapes))
+    _create_samples(root, header, schema.Sizes(len(response.loaded), len(body.points), len(shapes)))
     # The header comes last: a data set without one was never finished being made.
     root.attrs["header"] = json.dumps({**header, "format": FORMAT, "body": names, "checksums": checksums})
     return DataSet(path)
 
 
-def _create_samples(root: zarr.Group, header: dict[str, Any], loaded: int, nodes: int, modes: int) -> None:
+def _create_samples(root: zarr.Group, header: dict[str, Any], sizes: schema.Sizes) -> None:
     block = header["block"]
     blocks = sum(-(-header["samples"][split] // block) for split in SPLITS)
-    shapes: dict[str, tuple[tuple[int, ...], str]] = {
-        "forces": ((loaded, 3), "f8"),
-        "displacements": ((nodes, 3), "f8"),
-        "probes": ((modes,), "f8"),
-        "adjoints": ((loaded, 3), "f8"),
-        "energy": ((), "f8"),
-        "residual": ((), "f8"),
-        "iterations": ((), "i4"),
-        "load_steps": ((), "i4"),
-        "negative_pivots": ((), "i4"),
-        "reason": ((), "u1"),
-    }
-    for name, (shape, dtype) in shapes.items():
+    for name in schema.NAMES:
+        shape, kind = sizes.shape(name), schema.kind(name)
         root.create_array(
-            f"samples/{name}", shape=(blocks * block, *shape), chunks=(block, *shape), dtype=dtype, fill_value=0
+            f"samples/{name}", shape=(blocks * block, *shape), chunks=(block, *shape), dtype=kind, fill_value=0
         )
     root.create_array("samples/checksum", shape=(blocks,), chunks=(1,), dtype="u4", fill_value=0)
 
@@ -358,9 +339,10 @@ def write_block(path: Path, block: int, arrays: Mapping[str, NDArray[Any]]) -> N
     group = zarr.open_group(str(path), mode="r+")["samples"]
     size = len(arrays["reason"])
     part = slice(block * size, (block + 1) * size)
-    for name in _BLOCK_ARRAYS:
-        group[name][part] = arrays[name]
-    group["checksum"][block] = checksum(arrays)
+    typed = {name: np.asarray(arrays[name], dtype=schema.kind(name)) for name in schema.NAMES}
+    for name, values in typed.items():
+        group[name][part] = values
+    group["checksum"][block] = checksum(typed)
 
 
 def drop_block(path: Path, block: int) -> None:

@@ -46,6 +46,7 @@ from .materials import MATERIALS, Material
 from .modes import eigenmodes
 from .outcome import Equilibrium, NotConverged
 from .ranks import on_first, tell_all
+from .schema import Reason
 
 Floats = NDArray[np.float64]
 
@@ -407,7 +408,7 @@ def _solve_path(data: DataSet, plan: Plan, problem: Problem, path: int) -> Itera
     state: Equilibrium | None = None
     for i, factor in enumerate(factors):
         probe = np.random.default_rng([plan.seed, 3, path * plan.path + i]).standard_normal(len(data.shapes))
-        row = _empty_row(factor * load[loaded], probe, data)
+        row = data.sizes.failed() | {"forces": factor * load[loaded], "probes": probe}
         guess = None if state is None else _ahead(problem, state.displacement, (factor - factors[i - 1]) * load)
         try:
             state = problem.solve(factor * load, guess)
@@ -420,37 +421,20 @@ def _solve_path(data: DataSet, plan: Plan, problem: Problem, path: int) -> Itera
         yield row | _solved_row(state, adjoint, plan)
 
 
-def _empty_row(forces: Floats, probe: Floats, data: DataSet) -> dict[str, Any]:
-    return {
-        "forces": forces,
-        "displacements": np.zeros_like(data.body.points),
-        "probes": probe,
-        "adjoints": np.zeros_like(forces),
-        "energy": np.float64(0.0),
-        "residual": np.float64(0.0),
-        "iterations": np.int32(0),
-        "load_steps": np.int32(0),
-        "negative_pivots": np.int32(0),
-        "reason": np.uint8(1),
-    }
-
-
 def _solved_row(state: Equilibrium, adjoint: Floats, plan: Plan) -> dict[str, Any]:
     pivots = state.negative_pivots or 0
     return {
         "displacements": state.displacement,
         "adjoints": adjoint,
-        "energy": np.float64(state.energy),
-        "residual": np.float64(state.residual),
-        "iterations": np.int32(state.iterations),
-        "load_steps": np.int32(state.load_steps),
-        "negative_pivots": np.int32(pivots),
-        "reason": np.uint8(_judge(state.displacement, pivots, plan)),
+        **{name: getattr(state, name) for name in ("energy", "residual", "iterations", "load_steps")},
+        "negative_pivots": pivots,
+        "reason": _judge(state.displacement, pivots, plan),
     }
 
 
-def _judge(displacement: Floats, negative_pivots: int, plan: Plan) -> int:
+def _judge(displacement: Floats, negative_pivots: int, plan: Plan) -> Reason:
     if negative_pivots > 0:
-        return 2
+        return Reason.UNSTABLE
     scaled = plan.loads.amplitude is None
-    return 3 if scaled and _peak(displacement) > _BEYOND * plan.loads.displacement else 0
+    too_far = scaled and _peak(displacement) > _BEYOND * plan.loads.displacement
+    return Reason.BEYOND if too_far else Reason.ACCEPTED

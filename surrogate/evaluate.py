@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.metrics import nodal_distances, relative_error, thesis_error
-from softtwin.reference.dataset import REASONS, DataSet, Samples, Split, probe_cotangents
+from softtwin.reference.dataset import DataSet, Samples, Split, probe_cotangents
+from softtwin.reference.schema import Reason
 
 from .model import Surrogate
 
@@ -112,7 +113,7 @@ def evaluate(surrogate: Surrogate, data: DataSet, split: Split = "test", limit: 
     return Evaluation(
         split=split,
         samples=len(samples),
-        rejected=dict(Counter(REASONS[int(reason)] for reason in reasons if reason)),
+        rejected=dict(Counter(Reason(reason).words for reason in reasons if reason)),
         nodal_error=spread(distances.mean(axis=1)),
         largest_error=spread(distances.max(axis=1)),
         thesis_error=spread(thesis_error(found, samples.displacements)),

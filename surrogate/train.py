@@ -13,7 +13,8 @@ import lightning
 import numpy as np
 import torch
 
-from softtwin.reference.dataset import REASONS, DataSet, Samples
+from softtwin.reference.dataset import DataSet, Samples
+from softtwin.reference.schema import Reason
 
 from .checkpoint import CHECKPOINT, fingerprint, read_checkpoint
 from .course import Course, device, fit
@@ -76,7 +77,7 @@ def _check_split(data: DataSet, name: str, samples: Samples) -> None:
 def _card(data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], course: Course) -> dict[str, Any]:
     train_split = splits["train"]
     reasons = data.figures("train")["reason"][: plan.samples]
-    rejected = Counter(REASONS[int(reason)] for reason in reasons if reason)
+    rejected = Counter(Reason(reason).words for reason in reasons if reason)
     return {
         "architecture": plan.architecture.name,
         "plan": plan.entries(),

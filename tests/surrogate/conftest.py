@@ -18,6 +18,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.metrics import HEXAHEDRON_EDGES
 from softtwin.meshes.shapes import beam
 from softtwin.reference.dataset import DataSet, LinearResponse, create, write_block
+from softtwin.reference.schema import Reason
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
@@ -98,12 +99,12 @@ def _draw(truth: ClosedForm, loaded: NDArray[np.int64], draw: int) -> dict[str, 
         "displacements": truth.solve(load),
         "probes": probe,
         "adjoints": truth.adjoint(load, cotangent)[loaded],
-        "energy": np.float64(0.0),
-        "residual": np.float64(0.0),
-        "iterations": np.int32(1),
-        "load_steps": np.int32(1),
-        "negative_pivots": np.int32(0),
-        "reason": np.uint8(2 if draw % 5 == 4 else 0),
+        "energy": 0.0,
+        "residual": 0.0,
+        "iterations": 1,
+        "load_steps": 1,
+        "negative_pivots": 0,
+        "reason": Reason.UNSTABLE if draw % 5 == 4 else Reason.ACCEPTED,
     }
 
 
