@@ -21,6 +21,8 @@ from .model import Surrogate
 Floats = NDArray[np.float64]
 Adjoint = Callable[[Floats, Floats], Floats]
 
+_LEAST = 1e-300  # of a relative error, so that decibels stay numbers
+
 
 @dataclass(frozen=True)
 class Spread:
@@ -46,6 +48,7 @@ DEFINITIONS = (
     ("largest_error", "e_max", "largest over the nodes of |u_i - u*_i|", "m"),
     ("thesis_error", "e_thesis", "|u - u*|_2 / number of nodes", "m"),
     ("relative_error", "rel", "|u - u*|_2 / |u*|_2", "1"),
+    ("signal_to_noise", "SNR", "20 log10(|u*|_2 / |u - u*|_2)", "dB"),
     ("displacement_norm", "u_2", "|u*|_2 over all nodal components", "m"),
     ("gradient_cosine", "cos", "cosine of J^T g with the reference's K(u*)^-1 g at the loaded nodes, g stored", "1"),
 )
@@ -63,6 +66,7 @@ class Evaluation:
         largest_error: metres.
         thesis_error: metres.
         relative_error: dimensionless.
+        signal_to_noise: decibels (Odot 2023, Tables 5.1 and 5.2, names an SNR and does not define it).
         displacement_norm: metres.
         gradient_cosine: dimensionless.
         prediction_ms: median wall time of `solve` for one sample, milliseconds, in double precision on the CPU.
@@ -76,6 +80,7 @@ class Evaluation:
     largest_error: Spread
     thesis_error: Spread
     relative_error: Spread
+    signal_to_noise: Spread
     displacement_norm: Spread
     gradient_cosine: Spread
     prediction_ms: float
@@ -109,6 +114,7 @@ def evaluate(surrogate: Surrogate, data: DataSet, split: Split = "test", limit: 
         raise ValueError(f"evaluate.split: expected accepted samples in the {split} split of {data.path}, got none.")
     found, cosines, times = _predict(surrogate, data, samples)
     distances = nodal_distances(found, samples.displacements)
+    relative = relative_error(found, samples.displacements)
     reasons = data.figures(split)["reason"][:limit]
     return Evaluation(
         split=split,
@@ -117,7 +123,8 @@ def evaluate(surrogate: Surrogate, data: DataSet, split: Split = "test", limit: 
         nodal_error=spread(distances.mean(axis=1)),
         largest_error=spread(distances.max(axis=1)),
         thesis_error=spread(thesis_error(found, samples.displacements)),
-        relative_error=spread(relative_error(found, samples.displacements)),
+        relative_error=spread(relative),
+        signal_to_noise=spread(-20.0 * np.log10(np.clip(relative, _LEAST, 1.0 / _LEAST))),
         displacement_norm=spread(np.linalg.norm(samples.displacements, axis=(1, 2))),
         gradient_cosine=spread(cosines),
         prediction_ms=1e3 * float(np.median(times)),

@@ -28,6 +28,7 @@ def test_errors_follow_their_definitions(surrogate: Surrogate, data: DataSet) ->
     assert found.thesis_error.mean == pytest.approx(norms.mean() / 45)
     relative = norms / np.sqrt((truth**2).sum(axis=(1, 2)))
     assert found.relative_error.median == pytest.approx(np.median(relative))
+    assert found.signal_to_noise.median == pytest.approx(np.median(20.0 * np.log10(1.0 / relative)))
     assert found.displacement_norm.max == pytest.approx(np.sqrt((truth**2).sum(axis=(1, 2))).max())
 
 
