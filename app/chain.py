@@ -7,8 +7,8 @@ from pathlib import Path
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_body
-from softtwin.reference.dataset import DataSet, DataSetError, differences
-from softtwin.reference.loads import check_loads
+from softtwin.reference.data.dataset import DataSet, DataSetError, differences
+from softtwin.reference.data.samplers import check_loads
 from softtwin.surrogate.checkpoint import CheckpointError
 
 from .config import Config, ConfigError, to_toml

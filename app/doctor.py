@@ -154,7 +154,7 @@ def _torch() -> Check:
 
 def _fenicsx() -> Any:
     """The one module that knows how every version of DOLFINx wants to be imported."""
-    return importlib.import_module("softtwin.reference.fenicsx")
+    return importlib.import_module("softtwin.reference.fem.fenicsx")
 
 
 def _dolfinx() -> Check:

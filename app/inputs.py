@@ -11,8 +11,8 @@ from typing import Any
 from softtwin.meshes.attachment import parse_file
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_body
-from softtwin.reference.dataset import DataSet, DataSetError, differences, existing
-from softtwin.reference.loads import LoadPlan
+from softtwin.reference.data.dataset import DataSet, DataSetError, differences, existing
+from softtwin.reference.data.samplers import LoadPlan
 
 from .config import Config, ConfigError
 from .workspace import Workspace, read_records

@@ -23,7 +23,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import Embedding, carried, target_points
 from softtwin.meshes.files import read_body
 from softtwin.meshes.metrics import mesh_quality, nodal_errors
-from softtwin.reference.dataset import SPLITS, DataSet
+from softtwin.reference.data.dataset import SPLITS, DataSet
 from softtwin.registration.residuals import SurfaceDistance
 
 from .config import Config, to_toml

@@ -18,8 +18,8 @@ from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.embedding import Embedding, target_points
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import read_body
-from softtwin.reference.loads import loaded_nodes
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.data.samplers import loaded_nodes
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.lbfgs import LBFGS
@@ -439,9 +439,9 @@ def forward_model(name: str, folder: Path, body: Body, config: Config) -> Iterat
 
         yield load(folder, body)
         return
-    from softtwin.reference.equilibrium import NewtonOptions, Problem
-    from softtwin.reference.materials import MATERIALS
-    from softtwin.reference.model import ReferenceModel  # FEniCSx is needed here alone
+    from softtwin.reference.data.materials import MATERIALS
+    from softtwin.reference.derivatives.model import ReferenceModel  # FEniCSx is needed here alone
+    from softtwin.reference.solve.problem import NewtonOptions, Problem
 
     material = MATERIALS[config.material.law](config.material.young_modulus, config.material.poisson_ratio)
     with Problem(body, material, NewtonOptions(tolerance=1e-5, max_iterations=15)) as problem:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from softtwin.reference import lock
+from softtwin.reference.data import lock
 
 from .config import Config, ConfigError, read_config
 

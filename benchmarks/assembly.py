@@ -18,11 +18,11 @@ from record import write
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.discretisation import Discretisation
-from softtwin.reference.fenicsx import assemble_matrix, create_matrix
-from softtwin.reference.forms import Forms, Load
-from softtwin.reference.linear import LinearSolver
-from softtwin.reference.materials import NeoHookean
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.fem.discretisation import Discretisation
+from softtwin.reference.fem.fenicsx import assemble_matrix, create_matrix
+from softtwin.reference.fem.forms import Forms, Load
+from softtwin.reference.solve.linear import LinearSolver
 
 REPEATS = 15
 

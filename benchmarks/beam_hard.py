@@ -19,9 +19,9 @@ from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.materials import NeoHookean
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 Floats = NDArray[np.float64]
 YOUNG_MODULUS, POISSON_RATIO = 4500.0, 0.49

@@ -14,10 +14,10 @@ from scipy.optimize import brentq
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import Problem
-from softtwin.reference.loads import LoadPlan, draw_load
-from softtwin.reference.materials import NeoHookean
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.data.samplers import LoadPlan, draw_load
 from softtwin.reference.modes import eigenmodes
+from softtwin.reference.solve.problem import Problem
 
 YOUNG_MODULUS, POISSON_RATIO, AMPLITUDE = 5000.0, 0.45, 0.03
 WANTED = 0.3

@@ -19,9 +19,9 @@ from softtwin.app.config import Config
 from softtwin.app.launch import generate_in_parallel
 from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.dataset import DataSet, Samples
-from softtwin.reference.equilibrium import Problem
+from softtwin.reference.data.dataset import DataSet, Samples
 from softtwin.reference.generate import plan_from_header
+from softtwin.reference.solve.problem import Problem
 from softtwin.surrogate.evaluate import evaluate, registration_cosines, table
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.plan import TrainingPlan

@@ -22,8 +22,8 @@ from mpi4py import MPI
 from record import write
 
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.materials import NeoHookean
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 SIZES = {"mumps": (1e3, 3e3, 1e4, 3e4, 1e5), "multigrid": (1e3, 3e3, 1e4, 3e4, 1e5, 3e5, 1e6)}
 FITTED = 1e4  # unknowns from which on exponents are fitted

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from record import write
 from threadpoolctl import threadpool_limits
 
-from softtwin.reference.equilibrium import Problem
-from softtwin.reference.materials import NeoHookean
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.solve.problem import Problem
 
 MATERIAL = NeoHookean(YOUNG_MODULUS, POISSON_RATIO)
 FRAMES = (0, 25, 49)

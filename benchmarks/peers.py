@@ -35,8 +35,8 @@ from torchfem.sparse import ConvergenceError
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import Problem
-from softtwin.reference.materials import MATERIALS, lame
+from softtwin.reference.data.materials import MATERIALS, lame
+from softtwin.reference.solve.problem import Problem
 
 Floats = NDArray[np.float64]
 LOAD_STEPS = (1, 2, 4, 8, 16, 32, 64, 128)

@@ -21,9 +21,9 @@ from scipy.optimize import brentq
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.materials import NeoHookean, SaintVenantKirchhoff
-from softtwin.reference.sensitivity import Linearisation
+from softtwin.reference.data.materials import NeoHookean, SaintVenantKirchhoff
+from softtwin.reference.derivatives.linearisation import Linearisation
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 Floats = NDArray[np.float64]
 FRAMES = (0, 10, 25, 40)

@@ -15,10 +15,10 @@ import numpy as np
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
 from record import write
 
-from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.materials import NeoHookean
-from softtwin.reference.model import ReferenceModel, ReferenceState
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.derivatives.model import ReferenceModel, ReferenceState
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 COLUMNS = (1, 20, 100)
 

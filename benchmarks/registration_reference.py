@@ -15,9 +15,9 @@ from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequ
 from record import write
 
 from softtwin.meshes.embedding import embed
-from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.materials import NeoHookean
-from softtwin.reference.model import ReferenceModel
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.derivatives.model import ReferenceModel
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.registrar import (
     RegistrationOptions,

@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.shapes import liver_phantom
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import (
@@ -111,9 +111,9 @@ def forward_model(name: str, twin: Path) -> Iterator[ForwardModel]:
 
         yield load(twin, body)
         return
-    from softtwin.reference.equilibrium import NewtonOptions, Problem
-    from softtwin.reference.materials import NeoHookean
-    from softtwin.reference.model import ReferenceModel
+    from softtwin.reference.data.materials import NeoHookean
+    from softtwin.reference.derivatives.model import ReferenceModel
+    from softtwin.reference.solve.problem import NewtonOptions, Problem
 
     newton = NewtonOptions(tolerance=1e-5, max_iterations=15)
     with Problem(body, NeoHookean(YOUNG_MODULUS, POISSON_RATIO), newton) as problem:

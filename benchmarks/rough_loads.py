@@ -19,10 +19,10 @@ import numpy as np
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
 from record import write
 
-from softtwin.reference import newton
-from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.materials import NeoHookean
-from softtwin.reference.outcome import Equilibrium, NotConverged
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.data.outcome import Equilibrium, NotConverged
+from softtwin.reference.solve import newton
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 NOISES = (1.0, 1.5, 2.0, 2.5, 1.7)
 SAME_M = 1e-6

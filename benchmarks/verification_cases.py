@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.elements import KINDS, Kind, linear_kind, split_facets
-from softtwin.reference.materials import (
+from softtwin.reference.data.materials import (
     Energy,
     IncompressibleMooneyRivlin,
     IncompressibleNeoHookean,

@@ -12,10 +12,10 @@ from verification_cases import Floats, box, incompressible, shaken
 from verification_solutions import TIGHT, Row, Waves, orders
 
 from softtwin.meshes.body import Body
-from softtwin.reference.equilibrium import Loading, Problem
-from softtwin.reference.materials import Energy, Material
-from softtwin.reference.outcome import Equilibrium
-from softtwin.reference.sensitivity import Change, Gradient, Linearisation
+from softtwin.reference.data.materials import Energy, Material
+from softtwin.reference.data.outcome import Equilibrium
+from softtwin.reference.derivatives.linearisation import Change, Gradient, Linearisation
+from softtwin.reference.solve.problem import Loading, Problem
 
 DIFFERENCES = 1e-2 * 0.5 ** np.arange(4)  # of the largest displacement, and of the pressure
 STEPS = 0.5 ** np.arange(2, 6)

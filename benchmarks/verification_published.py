@@ -13,14 +13,14 @@ from verification_solutions import Row
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import Loading, Problem
-from softtwin.reference.materials import (
+from softtwin.reference.data.materials import (
     Energy,
     IncompressibleNeoHookean,
     IsochoricNeoHookean,
     Material,
     NeoHookean,
 )
+from softtwin.reference.solve.problem import Loading, Problem
 
 SIZE, LOAD = (1.0, 0.25, 0.25), 8.0  # the cantilever, metres, and its tip traction, pascals
 YOUNG_MODULUS = 5000.0

@@ -27,8 +27,8 @@ from verification_cases import (
 from verification_cases import gauss as gauss_points
 
 from softtwin.meshes.body import Body
-from softtwin.reference.equilibrium import Loading, NewtonOptions, Problem
-from softtwin.reference.materials import Energy, LinearElastic, Material, MooneyRivlin, SaintVenantKirchhoff, lame
+from softtwin.reference.data.materials import Energy, LinearElastic, Material, MooneyRivlin, SaintVenantKirchhoff, lame
+from softtwin.reference.solve.problem import Loading, NewtonOptions, Problem
 
 TIGHT = NewtonOptions(tolerance=1e-12)
 STRETCH, SHEAR, TWIST = 1.5, 0.6, 0.8

@@ -13,13 +13,12 @@ from importlib.util import find_spec
 
 FENICSX = ("dolfinx", "dolfinx_solver", "ufl", "basix", "ffcx", "petsc4py", "slepc4py")
 MESH_PACKAGES = {"gmsh", "pyacvd", "pytetwild", "pyvista"}
-PACKAGES = ("softtwin.meshes", "softtwin.surrogate", "softtwin.registration")
-SINGLE_MODULES = ("softtwin.reference.dataset",)
+PACKAGES = ("softtwin.meshes", "softtwin.reference.data", "softtwin.surrogate", "softtwin.registration")
 
 
 def modules() -> list[str]:
     """Names of all modules of the fast path."""
-    found = list(SINGLE_MODULES)
+    found: list[str] = []
     for name in PACKAGES:
         package = importlib.import_module(name)
         found += [name, *(module.name for module in pkgutil.walk_packages(package.__path__, f"{name}."))]

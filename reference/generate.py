@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from softtwin.meshes.body import Body
 
-from .dataset import (
+from .data.dataset import (
     SPLITS,
     DataSet,
     DataSetError,
@@ -38,15 +38,15 @@ from .dataset import (
     probe_cotangents,
     write_block,
 )
-from .equilibrium import NewtonOptions, Problem
-from .fenicsx import MPI, PETSc, dolfinx
-from .loads import LoadPlan, check_loads, draw_load, loaded_nodes
-from .lock import locked
-from .materials import MATERIALS, Material
+from .data.lock import locked
+from .data.materials import MATERIALS, Material
+from .data.outcome import Equilibrium, NotConverged
+from .data.samplers import LoadPlan, check_loads, draw_load, loaded_nodes
+from .data.schema import Reason
+from .fem.fenicsx import MPI, PETSc, dolfinx
 from .modes import eigenmodes
-from .outcome import Equilibrium, NotConverged
 from .ranks import on_first, tell_all
-from .schema import Reason
+from .solve.problem import NewtonOptions, Problem
 
 Floats = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from slepc4py import SLEPc
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import FileError, read_fields, write_body
 
-from .equilibrium import Problem
-from .fenicsx import MPI, PETSc
+from .fem.fenicsx import MPI, PETSc
+from .solve.problem import Problem
 
 Floats = NDArray[np.float64]
 Weighting = Literal["stiffness", "mass"]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.outcome import NotConverged
 
 from .evidence import Scales, find_scales, linearised
 from .loss import Huber, Loss, Tukey, robust_deviation

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.outcome import NotConverged
 
 from .gauss_newton import Found, LocalModel, Step
 from .loss import Huber, Loss, Tukey, robust_deviation

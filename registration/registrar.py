@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import check_cloud
 from softtwin.meshes.metrics import edge_lengths
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.outcome import NotConverged
 
 from .evidence import Scale
 from .forward import ForwardModel, ReducedModel, State, reduce_model

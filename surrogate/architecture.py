@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor, nn
 
-from softtwin.reference.dataset import DataSet, Samples
+from softtwin.reference.data.dataset import DataSet, Samples
 
 from .maps import LinearMaps
 

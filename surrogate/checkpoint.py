@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from softtwin.reference.dataset import DataSet, Samples
+from softtwin.reference.data.dataset import DataSet, Samples
 
 from .plan import TrainingPlan
 

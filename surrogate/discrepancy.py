@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from softtwin.reference.dataset import DataSet, Samples
+from softtwin.reference.data.dataset import DataSet, Samples
 
 from .model import Surrogate
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from softtwin.reference.dataset import DataSet
+from softtwin.reference.data.dataset import DataSet
 
 from .model import Surrogate
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.metrics import nodal_distances, relative_error, thesis_error
-from softtwin.reference.dataset import DataSet, Samples, Split, probe_cotangents
-from softtwin.reference.schema import Reason
+from softtwin.reference.data.dataset import DataSet, Samples, Split, probe_cotangents
+from softtwin.reference.data.schema import Reason
 
 from .model import Surrogate
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softtwin.reference.dataset import LinearResponse
+from softtwin.reference.data.dataset import LinearResponse
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

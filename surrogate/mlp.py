@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from softtwin.reference.dataset import DataSet, Samples
+from softtwin.reference.data.dataset import DataSet, Samples
 
 from .architecture import Network
 from .maps import LinearMaps, no_response

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
-from softtwin.reference.loading import checked_array
+from softtwin.reference.data.loading import checked_array
 
 from .architecture import Linearisation, Network
 from .maps import LinearMaps

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from softtwin.reference.dataset import DataSet, LinearResponse, Samples, probe_cotangents
+from softtwin.reference.data.dataset import DataSet, LinearResponse, Samples, probe_cotangents
 
 from .architecture import Network
 from .maps import LinearMaps, response_parts

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from softtwin.meshes.body import Body
 from softtwin.meshes.elements import linear_kind
 from softtwin.meshes.quadrature import quadrature, quadrature_degree, shape_functions
-from softtwin.reference.materials import Energy, Material
+from softtwin.reference.data.materials import Energy, Material
 
 from .algebra import TorchAlgebra
 

@@ -13,8 +13,8 @@ import lightning
 import numpy as np
 import torch
 
-from softtwin.reference.dataset import DataSet, Samples
-from softtwin.reference.schema import Reason
+from softtwin.reference.data.dataset import DataSet, Samples
+from softtwin.reference.data.schema import Reason
 
 from .checkpoint import CHECKPOINT, fingerprint, read_checkpoint
 from .course import Course, device, fit

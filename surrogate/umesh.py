@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from softtwin.meshes.body import Body
-from softtwin.reference.dataset import DataSet, Samples
+from softtwin.reference.data.dataset import DataSet, Samples
 
 from .scaled import FieldLesson, FieldNetwork
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from softtwin.meshes.body import Body
-from softtwin.reference.dataset import DataSet
+from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.ranks import on_first
 
 from ..inputs import current_body, generate_inputs, plan_entries
@@ -27,7 +27,7 @@ def generate_stage(configuration: Path, redo: Sequence[int] = (), again: bool = 
         DataSetError: the folder holds a data set of another configuration, or somebody else writes it.
         FailedElsewhere: on the other ranks, where rank 0 raises one of these.
     """
-    from softtwin.reference.fenicsx import MPI  # FEniCSx is needed by this stage alone
+    from softtwin.reference.fem.fenicsx import MPI  # FEniCSx is needed by this stage alone
     from softtwin.reference.generate import generate, plan_from_header
 
     comm, begin = MPI.COMM_WORLD, time.perf_counter()

@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 
 from softtwin.meshes.metrics import nodal_distances
-from softtwin.reference.dataset import DataSet
+from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.evaluate import evaluate

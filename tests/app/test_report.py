@@ -25,7 +25,7 @@ from softtwin.app.workspace import Workspace
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.dataset import LinearResponse, create, write_block
+from softtwin.reference.data.dataset import LinearResponse, create, write_block
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registration

@@ -9,11 +9,11 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from verification_cases import PLANE, QUADRATIC, SPACE, box
 
-from softtwin.reference import assembly
-from softtwin.reference.discretisation import Discretisation
-from softtwin.reference.fenicsx import assemble_matrix, create_matrix
-from softtwin.reference.forms import Forms, Load
-from softtwin.reference.materials import IncompressibleNeoHookean, Material, NeoHookean
+from softtwin.reference.data.materials import IncompressibleNeoHookean, Material, NeoHookean
+from softtwin.reference.fem import assembly
+from softtwin.reference.fem.discretisation import Discretisation
+from softtwin.reference.fem.fenicsx import assemble_matrix, create_matrix
+from softtwin.reference.fem.forms import Forms, Load
 
 CASES = [(kind, False) for kind in (*PLANE, *SPACE)] + [(kind, True) for kind in QUADRATIC]
 

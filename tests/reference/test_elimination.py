@@ -10,11 +10,11 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 from scipy.sparse import csr_matrix
 from verification_cases import PLANE, SPACE, box
 
-from softtwin.reference.discretisation import Discretisation
-from softtwin.reference.elimination import CellElimination
-from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.forms import Forms, Load
-from softtwin.reference.materials import NeoHookean
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.fem.discretisation import Discretisation
+from softtwin.reference.fem.forms import Forms, Load
+from softtwin.reference.solve.elimination import CellElimination
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 MATERIAL = NeoHookean(4500.0, 0.45)
 

@@ -8,9 +8,9 @@ import pytest
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
-from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.materials import MATERIALS, NeoHookean, SaintVenantKirchhoff, lame
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.materials import MATERIALS, NeoHookean, SaintVenantKirchhoff, lame
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 E, NU = 5000.0, 0.45
 

@@ -19,11 +19,11 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference import dataset
-from softtwin.reference.dataset import SPLITS, DataSet, DataSetError, drop_block, probe_cotangents
-from softtwin.reference.equilibrium import NewtonOptions, Problem
+from softtwin.reference.data import dataset
+from softtwin.reference.data.dataset import SPLITS, DataSet, DataSetError, drop_block, probe_cotangents
+from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.generate import DamagedBlock, Plan, generate, linear_response, solve_block
-from softtwin.reference.loads import LoadPlan
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 PLAN = Plan(
     loads=LoadPlan(modes=6, displacement=0.08),
@@ -35,7 +35,7 @@ PROGRAM = """
 import sys
 from softtwin.meshes.shapes import beam
 from softtwin.reference.generate import Plan, generate
-from softtwin.reference.loads import LoadPlan
+from softtwin.reference.data.samplers import LoadPlan
 plan = Plan(loads=LoadPlan(modes=6, displacement=0.08), block=3, seed=5,
             samples={"train": 9, "validation": 3, "test": 4})
 generate(sys.argv[1], beam((6, 2, 2), (0.6, 0.2, 0.2), "hexahedron"), plan)
@@ -221,7 +221,7 @@ FAILING = """
 import sys
 from softtwin.meshes.shapes import beam
 from softtwin.reference import generate as farm
-from softtwin.reference.fenicsx import MPI
+from softtwin.reference.fem.fenicsx import MPI
 from softtwin.reference.ranks import FailedElsewhere
 rank = MPI.COMM_WORLD.rank
 def full(*_):

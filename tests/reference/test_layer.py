@@ -15,9 +15,9 @@ import ufl
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import NewtonOptions, Problem
-from softtwin.reference.layer import EquilibriumLayer
-from softtwin.reference.materials import Energy, NeoHookean
+from softtwin.reference.data.materials import Energy, NeoHookean
+from softtwin.reference.derivatives.layer import EquilibriumLayer
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 E, NU = 5.0, 0.3  # soft and small: displacements, forces and moduli of like size suit differences
 EXACT = NewtonOptions(tolerance=1e-12)

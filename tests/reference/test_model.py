@@ -12,10 +12,10 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import Loading, NewtonOptions, Problem
-from softtwin.reference.materials import IncompressibleNeoHookean, Material, NeoHookean
-from softtwin.reference.model import ReferenceModel, ReferenceState
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.materials import IncompressibleNeoHookean, Material, NeoHookean
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.derivatives.model import ReferenceModel, ReferenceState
+from softtwin.reference.solve.problem import Loading, NewtonOptions, Problem
 
 EXACT = NewtonOptions(tolerance=1e-11)
 INFLATED = Loading(body_force=[0.0, 0.0, -80.0], pressure={"top": 60.0})  # an open surface: an unsymmetric tangent

@@ -11,10 +11,10 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import FileError, read_body, write_body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import Problem
-from softtwin.reference.loads import LoadPlan, draw_load, loaded_nodes
-from softtwin.reference.materials import NeoHookean
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.data.samplers import LoadPlan, draw_load, loaded_nodes
 from softtwin.reference.modes import eigenmodes, load_modes, save_modes
+from softtwin.reference.solve.problem import Problem
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,7 @@ import ufl
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import Loading, NewtonOptions, Problem
-from softtwin.reference.materials import (
+from softtwin.reference.data.materials import (
     Energy,
     IncompressibleMooneyRivlin,
     IncompressibleNeoHookean,
@@ -28,7 +27,8 @@ from softtwin.reference.materials import (
     NeoHookean,
     SaintVenantKirchhoff,
 )
-from softtwin.reference.outcome import Equilibrium, NotConverged
+from softtwin.reference.data.outcome import Equilibrium, NotConverged
+from softtwin.reference.solve.problem import Loading, NewtonOptions, Problem
 
 E, NU = 5000.0, 0.4
 
@@ -308,9 +308,9 @@ import sys
 import numpy as np
 from mpi4py import MPI
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import Loading, NewtonOptions, Problem
-from softtwin.reference.materials import IncompressibleNeoHookean, NeoHookean
-from softtwin.reference.sensitivity import Linearisation
+from softtwin.reference.solve.problem import Loading, NewtonOptions, Problem
+from softtwin.reference.data.materials import IncompressibleNeoHookean, NeoHookean
+from softtwin.reference.derivatives.linearisation import Linearisation
 
 comm, found = MPI.COMM_WORLD, {}
 body = beam((6, 2, 2), (0.6, 0.2, 0.2), "tetrahedron")

@@ -11,8 +11,8 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.checks import compacted
 from softtwin.meshes.grid import SparseGrid, sparse_grid
 from softtwin.meshes.shapes import beam
-from softtwin.reference.equilibrium import Problem
-from softtwin.reference.materials import NeoHookean
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.solve.problem import Problem
 
 MATERIAL = NeoHookean(5000.0, 0.3)
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.outcome import NotConverged
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,12 +15,12 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 pytest.importorskip("torch", reason="torch is absent")
 
 from softtwin.meshes.body import Body
-from softtwin.reference.dataset import DataSet
-from softtwin.reference.equilibrium import NewtonOptions, Problem
+from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.data.samplers import LoadPlan
+from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.generate import Plan, generate
-from softtwin.reference.loads import LoadPlan
-from softtwin.reference.model import ReferenceModel
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.solve.problem import NewtonOptions, Problem
 from softtwin.registration.forward import ForwardModel
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.plan import TrainingPlan

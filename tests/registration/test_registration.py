@@ -7,7 +7,7 @@ import pytest
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
-from softtwin.reference.outcome import NotConverged
+from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.evidence import Scale
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.lbfgs import LBFGS

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softtwin.reference.dataset import DataSet
+from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate import discrepancy
 from softtwin.surrogate.discrepancy import relative_errors, with_discrepancy
 from softtwin.surrogate.model import Surrogate

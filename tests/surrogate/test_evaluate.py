@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.shapes import beam
-from softtwin.reference.dataset import DataSet
+from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.evaluate import DEFINITIONS, cosine, evaluate, registration_cosines, spread, table
 from softtwin.surrogate.model import Surrogate
 

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.dataset import DataSet
+from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.twin import CARD, WEIGHTS, TwinError, load, save

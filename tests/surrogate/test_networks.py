@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from softtwin.reference.dataset import DataSet
+from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.architecture import Architecture, Differentiated, Network
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.reduced import AveragedNetwork, Reduced

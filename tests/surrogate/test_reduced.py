@@ -8,7 +8,7 @@ import torch
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.dataset import DataSet
+from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate import reduced as reduced_module
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.pod import correction_modes

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.materials import (
+from softtwin.reference.data.materials import (
     Energy,
     IncompressibleNeoHookean,
     IsochoricNeoHookean,
@@ -52,7 +52,7 @@ def batch(*fields: np.ndarray) -> Tensor:
     ("kind", "degree", "curved"), [(k, d, c) for k in KINDS for d, c in ((1, False), (2, False), (2, True))]
 )
 def test_energy_and_forces_are_the_references(law: Material, kind: str, degree: int, curved: bool, rng) -> None:
-    from softtwin.reference.equilibrium import Problem
+    from softtwin.reference.solve.problem import Problem
 
     body = body_of(kind, degree, curved)
     weights = rng.uniform(0.3, 1.0, len(body.cells))
@@ -68,7 +68,7 @@ def test_energy_and_forces_are_the_references(law: Material, kind: str, degree: 
 
 @pytest.mark.fenicsx
 def test_each_cell_has_its_own_parameters_and_equilibria_have_no_residual(rng) -> None:
-    from softtwin.reference.equilibrium import NewtonOptions, Problem
+    from softtwin.reference.solve.problem import NewtonOptions, Problem
 
     body = body_of("hexahedron")
     law = NeoHookean(rng.uniform(3e3, 6e3, len(body.cells)), 0.45)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import splu
 
-from .assembly import cell_unknowns
-from .discretisation import Discretisation
-from .fenicsx import CellMatrices, cell_dofs
+from ..fem.assembly import cell_unknowns
+from ..fem.discretisation import Discretisation
+from ..fem.fenicsx import CellMatrices, cell_dofs
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

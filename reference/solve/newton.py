@@ -11,11 +11,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.outcome import Iteration
+from ..fem.fenicsx import PETSc
+from ..fem.forms import Forms, Load
 from .elimination import CellElimination
-from .fenicsx import PETSc
-from .forms import Forms, Load
 from .linear import METHODS, LinearSolver, Method, chosen_method
-from .outcome import Iteration
 
 Floats = NDArray[np.float64]
 Search = Literal["energy", "full", "bt", "l2", "cp"]

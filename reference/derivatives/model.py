@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from softtwin.meshes.body import Body
 
-from .equilibrium import Problem
-from .loading import Loading, checked_array
-from .materials import Material
-from .outcome import Equilibrium
+from ..data.loading import Loading, checked_array
+from ..data.materials import Material
+from ..data.outcome import Equilibrium
+from ..solve.problem import Problem
 
 Floats = NDArray[np.float64]
 

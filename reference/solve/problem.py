@@ -13,15 +13,15 @@ from scipy.sparse import csr_matrix
 
 from softtwin.meshes.body import Body
 
-from .discretisation import Discretisation
-from .fenicsx import MPI, create_matrix, form, ufl
-from .fenicsx import assemble_matrix as assemble
-from .forms import Forms, Load
+from ..data.loading import Loading, checked_loading
+from ..data.materials import Material
+from ..data.outcome import Equilibrium, NotConverged
+from ..fem.discretisation import Discretisation
+from ..fem.fenicsx import MPI, create_matrix, form, ufl
+from ..fem.fenicsx import assemble_matrix as assemble
+from ..fem.forms import Forms, Load
 from .linear import LinearSolver
-from .loading import Loading, checked_loading
-from .materials import Material
 from .newton import Attempt, Newton, NewtonOptions
-from .outcome import Equilibrium, NotConverged
 
 __all__ = ["Loading", "NewtonOptions", "Problem"]
 

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.quadrature import quadrature_degree
 
+from ..data.loading import Loading
+from ..data.materials import Energy, Material, Parameter, is_same_law
 from .assembly import CellSum, suits
 from .discretisation import Discretisation
 from .fenicsx import (
@@ -28,8 +30,6 @@ from .fenicsx import (
     sparsity,
     ufl,
 )
-from .loading import Loading
-from .materials import Energy, Material, Parameter, is_same_law
 
 Floats = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .discretisation import Discretisation
-from .equilibrium import Problem
-from .fenicsx import assemble_vector, cell_space, fem, form, ghosted_vector, scalar, ufl
-from .forms import Forms, Load, deformed_area
-from .loading import Loading, checked_array, checked_loading
-from .outcome import Equilibrium
+from ..data.loading import Loading, checked_array, checked_loading
+from ..data.outcome import Equilibrium
+from ..fem.discretisation import Discretisation
+from ..fem.fenicsx import assemble_vector, cell_space, fem, form, ghosted_vector, scalar, ufl
+from ..fem.forms import Forms, Load, deformed_area
+from ..solve.problem import Problem
 
 Floats = NDArray[np.float64]
 

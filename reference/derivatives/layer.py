@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .equilibrium import Problem
-from .materials import with_parameters
-from .outcome import Equilibrium
-from .sensitivity import Change, Linearisation
+from ..data.materials import with_parameters
+from ..data.outcome import Equilibrium
+from ..solve.problem import Problem
+from .linearisation import Change, Linearisation
 
 Floats = NDArray[np.float64]
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.elements import Kind, linear_kind
 
+from ..data.loading import checked_array
 from .fenicsx import (
     MPI,
     cell_dofs,
@@ -32,7 +33,6 @@ from .fenicsx import (
     vector_space,
     vtk_order,
 )
-from .loading import checked_array
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -8,9 +8,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..fem.discretisation import Discretisation, rigid_motions
+from ..fem.fenicsx import PETSc, ghosted_vector
 from .band import BandFactor, band_order
-from .discretisation import Discretisation, rigid_motions
-from .fenicsx import PETSc, ghosted_vector
 
 Floats = NDArray[np.float64]
 Method = Literal["auto", "band", "mumps", "multigrid"]

@@ -1,0 +1,1 @@
+"""Finite elements: numbering, forms and their assembly (DOLFINx)."""
