@@ -21,7 +21,7 @@ from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.fem.discretisation import Discretisation
 from softtwin.reference.fem.fenicsx import assemble_matrix, create_matrix
-from softtwin.reference.fem.forms import Forms, Load
+from softtwin.reference.fem.forms import DiscreteLoad, Forms
 from softtwin.reference.solve.linear import LinearSolver
 
 REPEATS = 15
@@ -38,7 +38,7 @@ def compare(body: Body) -> dict[str, Any]:
     forms = Forms(space, NeoHookean(YOUNG_MODULUS, POISSON_RATIO))
     state = 1e-5 * body.size * np.random.default_rng(0).standard_normal(space.owned)
     state[space.fixed] = 0.0
-    load = Load(*np.zeros((2, space.owned)), {})
+    load = DiscreteLoad(*np.zeros((2, space.owned)), {})
     mine, theirs = forms.create_matrix(), create_matrix(forms.tangent_form)
     pairs = [
         (

@@ -15,6 +15,7 @@ from softtwin.meshes.body import Body
 from softtwin.reference.data.materials import Energy, Material
 from softtwin.reference.data.outcome import Equilibrium
 from softtwin.reference.derivatives.linearisation import Change, Gradient, Linearisation
+from softtwin.reference.fem.forms import DiscreteLoad
 from softtwin.reference.solve.problem import Loading, Problem
 
 DIFFERENCES = 1e-2 * 0.5 ** np.arange(4)  # of the largest displacement, and of the pressure
@@ -34,7 +35,7 @@ def tangent(material: Material, kind: str) -> Row:
     body = box(kind, 2, shaken)
     rng = np.random.default_rng(1)
     with Problem(body, material, TIGHT, held={"x0": "xyz"[: body.dimension]}) as problem:
-        space, forms = problem._space, problem._forms
+        space, forms = problem.system.space, problem.system.forms
         state = space.unknowns(
             "u", Waves(body.dimension, 0.2).displacement(body.points), rng.normal(size=len(body.points))
         )
@@ -58,8 +59,9 @@ def tangent(material: Material, kind: str) -> Row:
 
 
 def _assembled(problem: Problem, state: Floats) -> csr_matrix:
-    problem._newton.assemble(state, problem._unloaded)
-    matrix = problem._newton.matrix
+    tangent = problem.system.tangent
+    tangent.assemble(state, DiscreteLoad.none(problem.system.space))
+    matrix = tangent.matrix
     indptr, indices, values = matrix.getValuesCSR()
     return csr_matrix((values, indices, indptr), shape=matrix.getSize())
 

@@ -11,10 +11,12 @@ class TorchAlgebra:
 
     Args:
         like: a tensor of the precision and on the device wanted.
+        least: determinants below it are given as a^2 / (2 a - det) with a = least, which is positive and joins
+            smoothly, so that energies of what is inside out are finite; 0 leaves them as they are.
     """
 
-    def __init__(self, like: Tensor) -> None:
-        self.like = like
+    def __init__(self, like: Tensor, least: float = 0.0) -> None:
+        self.like, self.least = like, least
 
     def Identity(self, size: int) -> Tensor:  # noqa: N802 - UFL's name
         """The unit tensor."""
@@ -38,7 +40,10 @@ class TorchAlgebra:
 
     def det(self, A: Tensor) -> Tensor:
         """The determinant of 3 x 3."""
-        return (A[..., 0, :] * torch.linalg.cross(A[..., 1, :], A[..., 2, :])).sum(dim=-1)
+        found = (A[..., 0, :] * torch.linalg.cross(A[..., 1, :], A[..., 2, :])).sum(dim=-1)
+        if not self.least:
+            return found
+        return torch.where(found < self.least, self.least**2 / (2 * self.least - found.clamp_max(self.least)), found)
 
     def inner(self, A: Tensor, B: Tensor) -> Tensor:
         """A : B."""

@@ -85,6 +85,16 @@ class Lesson(Protocol):
     def loss(self, batch: Tensor) -> Tensor:
         """Loss over the samples with the given numbers, (s,)."""
 
+    @property
+    def validation_count(self) -> int:
+        """Number of validation samples."""
+
+    def fields(self, batch: Tensor, validation: bool = False) -> tuple[Tensor, Tensor]:
+        """Predicted displacements and forces of the samples with the given numbers, (s, n, 3) each, metres, newtons.
+
+        Those of all nodes; an image of a sample stands where the sample does. For losses that know physics.
+        """
+
     def error(self) -> float:
         """Error over the validation samples: the weights with the least are kept."""
 

@@ -53,7 +53,7 @@ def read_checkpoint(path: Path, plan: TrainingPlan, mark: str) -> dict[str, Any]
             "this program. Delete it to train from the start."
         ) from error
     wanted = plan.entries()
-    differing = [name for name in wanted if course["plan"].get(name, ...) != wanted[name]]
+    differing = [name for name in wanted if course["plan"].get(name) != wanted[name]]
     if differing:
         raise CheckpointError(
             f"train.folder: {path} belongs to another plan (differs in {', '.join(differing)}); choose another folder, "

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from .architecture import Architecture
+from .physics import Physics
 from .reduced import Reduced
 
 
@@ -24,6 +25,7 @@ class TrainingPlan:
         learning_rate: highest of the cosine; None for the architecture's own.
         samples: draws of the training split to use; None for all.
         seed: seed of weights and batches.
+        physics: what is asked of predictions beside, or instead of, the data; None for the data alone.
 
     Raises:
         ValueError: an argument out of its range.
@@ -36,6 +38,7 @@ class TrainingPlan:
     learning_rate: float | None = None
     samples: int | None = None
     seed: int = 0
+    physics: Physics | None = None
 
     def __post_init__(self) -> None:
         for name in ("epochs", "batch", "samples"):
@@ -59,7 +62,9 @@ class TrainingPlan:
     def entries(self) -> dict[str, Any]:
         """All settings by name, those of the architecture among them, for cards and checkpoints."""
         kind = self.architecture
-        return {"architecture": kind.name, **_settings(kind), **_settings(self, "architecture")}
+        physics = None if self.physics is None else asdict(self.physics)
+        own = {**_settings(self, "architecture"), "physics": physics}
+        return {"architecture": kind.name, **_settings(kind), **own}
 
 
 def _settings(plan: Any, *apart: str) -> dict[str, Any]:

@@ -242,6 +242,11 @@ class ReducedLesson(nn.Module):
         ValueError: no training samples, or none that differ from the linear response.
     """
 
+    forces: Tensor
+    turns: Tensor
+    modes: Tensor
+    left: Tensor
+    right: Tensor
     loads: Tensor
     targets: Tensor
     weights: Tensor
@@ -249,6 +254,7 @@ class ReducedLesson(nn.Module):
     adjoints: Tensor
     adjoint_weights: Tensor
     metric: Tensor
+    validation_forces: Tensor
     validation_loads: Tensor
     validation_targets: Tensor
     validation_rest: Tensor
@@ -278,6 +284,25 @@ class ReducedLesson(nn.Module):
         missed = (self.network(self.loads[batch]) - self.targets[batch]).square().sum(dim=1)
         loss = (missed * self.weights[batch]).mean()
         return loss + self.sobolev * self._gradient_loss(batch[: -(-len(batch) // _SHARE)]) if self.sobolev else loss
+
+    @property
+    def validation_count(self) -> int:
+        """Number of validation samples."""
+        return len(self.validation_loads)
+
+    def fields(self, batch: Tensor, validation: bool = False) -> tuple[Tensor, Tensor]:
+        """Predicted displacements and forces of the samples with the given numbers, (s, n, 3) each, metres, newtons.
+
+        Those of an image are turned back, and are its sample's.
+        """
+        forces, loads = (self.validation_forces, self.validation_loads) if validation else (self.forces, self.loads)
+        samples, turns = batch % len(forces), self.turns[batch // len(forces)]
+        coordinates = torch.einsum("sij,si->sj", turns, self.network(loads[batch]))
+        given = forces[samples]
+        displacement = (given @ self.right.T) @ self.left.T + coordinates @ self.modes.T
+        entries = torch.as_tensor(self.response.loaded, device=given.device)
+        moved = displacement.unflatten(1, (-1, 3))
+        return moved, torch.zeros_like(moved).index_copy(1, entries, given.unflatten(1, (-1, 3)))
 
     def _gradient_loss(self, batch: Tensor) -> Tensor:
         loads = self.loads[batch].requires_grad_()
@@ -320,6 +345,10 @@ class ReducedLesson(nn.Module):
         self._store("loads", basis.images(train.forces.reshape(len(train), -1) @ basis.restricted))
         self._store("targets", basis.images(corrections.reshape(len(train), -1) @ basis.modes))
         self._store("weights", np.tile(1.0 / self._scale(train), group))
+        self._store("forces", train.forces.reshape(len(train), -1))
+        named = {"turns": basis.turns, "modes": basis.modes, "left": self.response.left, "right": self.response.right}
+        for name, values in named.items():
+            self._store(name, values)
         if self.sobolev > 0.0:
             self._store_adjoints(data, train)
 
@@ -341,6 +370,7 @@ class ReducedLesson(nn.Module):
     def _store_validation(self, validation: Samples, corrections: Floats) -> None:
         flat = corrections.reshape(len(validation), -1)
         targets = flat @ self.basis.modes
+        self._store("validation_forces", validation.forces.reshape(len(validation), -1))
         self._store("validation_loads", validation.forces.reshape(len(validation), -1) @ self.basis.restricted)
         self._store("validation_targets", targets)
         self._store("validation_rest", ((flat - targets @ self.basis.modes.T) ** 2).sum(axis=1))

@@ -26,6 +26,8 @@ class ElasticBody(nn.Module):
         body: the body, in space.
         material: strain energy; not mixed, and not an own `Energy`, which is written in UFL.
         weights: factor of each cell's energy, (cells,), the part of the cell that is filled; 1 if not given.
+        least_jacobian: for training: det F below it counts for more (`TorchAlgebra`), and nothing is NaN; 0 leaves all
+            as it is.
 
     Raises:
         ValueError: a plane body, a material of the kinds above, or weights of another shape.
@@ -36,7 +38,9 @@ class ElasticBody(nn.Module):
     cells: Tensor
     free: Tensor
 
-    def __init__(self, body: Body, material: Material, weights: ArrayLike | None = None) -> None:
+    def __init__(
+        self, body: Body, material: Material, weights: ArrayLike | None = None, *, least_jacobian: float = 0.0
+    ) -> None:
         super().__init__()
         if body.dimension != 3:
             raise ValueError(f"ElasticBody.body: expected a body in space, got one of {body.dimension} dimensions.")
@@ -47,7 +51,7 @@ class ElasticBody(nn.Module):
         part = np.ones(len(body.cells)) if weights is None else np.asarray(weights, dtype=np.float64)
         if part.shape != (len(body.cells),):
             raise ValueError(f"ElasticBody.weights: expected shape ({len(body.cells)},), got {part.shape}.")
-        self.material, self.nodes = material, len(body.points)
+        self.material, self.nodes, self.least_jacobian = material, len(body.points), least_jacobian
         points, factors = quadrature(body.kind, quadrature_degree(body))
         shaped = linear_kind(body.kind) if body.is_straight else body.kind
         corners = body.points[body.cells[:, : shaped.nodes]]
@@ -113,5 +117,5 @@ class ElasticBody(nn.Module):
 
     def _density(self, F: Tensor) -> Tensor:
         named = {name: getattr(self, f"parameter_{name}") for name in self.material.parameters}
-        density: Tensor = self.material.energy(F, None, SimpleNamespace(**named), TorchAlgebra(F))
+        density: Tensor = self.material.energy(F, None, SimpleNamespace(**named), TorchAlgebra(F, self.least_jacobian))
         return density

@@ -55,6 +55,19 @@ class ScaledLesson(nn.Module):
         """Mean squared error over the samples with the given numbers."""
         return nn.functional.mse_loss(self.network(self.forces[batch]), self.displacements[batch])
 
+    @property
+    def validation_count(self) -> int:
+        """Number of validation samples."""
+        return len(self.validation_forces)
+
+    def fields(self, batch: Tensor, validation: bool = False) -> tuple[Tensor, Tensor]:
+        """Predicted displacements and forces of the samples with the given numbers, (s, n, 3) each, metres, newtons."""
+        given = (self.validation_forces if validation else self.forces)[batch]
+        displacement = self.displacement_scale * self.network(given).unflatten(1, (-1, 3))
+        forces = (self.force_scale * given).unflatten(1, (-1, 3))
+        entries = torch.as_tensor(self.loaded, device=given.device)
+        return displacement, torch.zeros_like(displacement).index_copy(1, entries, forces)
+
     @torch.no_grad()
     def error(self) -> float:
         """Mean squared error over the validation samples."""

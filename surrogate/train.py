@@ -19,6 +19,7 @@ from softtwin.reference.data.schema import Reason
 from .checkpoint import CHECKPOINT, fingerprint, read_checkpoint
 from .course import Course, device, fit
 from .model import Surrogate
+from .physics import with_physics
 from .plan import TrainingPlan
 
 
@@ -52,7 +53,8 @@ def train(
         resumed = read_checkpoint(path, plan, mark) if path.exists() else None
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(plan.seed)
-            lesson = plan.architecture.lesson(data, splits["train"], splits["validation"]).to(device())
+            lesson = plan.architecture.lesson(data, splits["train"], splits["validation"])
+        lesson = with_physics(lesson, data, plan.physics).to(device())
         course = Course(lesson, plan, mark, clock)
         if resumed:
             course.take_back(resumed)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body, Surface
 
 from . import schema
+from .materials import MATERIALS, Material
 from .schema import Reason
 
 Floats = NDArray[np.float64]
@@ -145,6 +146,19 @@ class DataSet:
     def sizes(self) -> schema.Sizes:
         """What the shape of a sample depends on."""
         return schema.Sizes(len(self.response.loaded), len(self.body.points), len(self.shapes))
+
+    @property
+    def material(self) -> Material:
+        """Strain energy of the equilibria.
+
+        Raises:
+            DataSetError: the header does not say.
+        """
+        plan = self.header.get("plan", {})
+        try:
+            return MATERIALS[plan["material"]](plan["young_modulus"], plan["poisson_ratio"])
+        except KeyError as error:
+            raise DataSetError(f"DataSet: expected a known material in the header of {self.path}, got none.") from error
 
     @property
     def identity(self) -> str:

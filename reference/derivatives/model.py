@@ -61,8 +61,9 @@ class ReferenceModel:
 
         Args:
             forces: nodal forces.
-            near: a state to start from; one of this model's is first moved along its tangent by the change of the
-                forces. The warped linear response if not given.
+            near: a state to start from. The neighbour of one of this model's is wanted: it is first moved along its
+                tangent by the change of the forces. Another model's is a proposal, which is weighed against the
+                warped linear response. That response alone if not given.
 
         Raises:
             NotConverged: no equilibrium was found; states that were found before stay as they are.
@@ -71,8 +72,11 @@ class ReferenceModel:
         given.flags.writeable = False
         fixed = self.loading.forces
         load = replace(self.loading, forces=given if fixed is None else given + np.asarray(fixed))
-        start = near.equilibrium if isinstance(near, ReferenceState) else None if near is None else near.displacement
-        found = self.problem.solve(load, start, stability=False, fallback=self.patient or start is None)
+        guess = near.equilibrium if isinstance(near, ReferenceState) else None
+        proposal = None if near is None or guess is not None else near.displacement
+        found = self.problem.solve(
+            load, guess, proposal=proposal, stability=False, fallback=self.patient or guess is None
+        )
         return ReferenceState(given, found, self, self.problem.material)
 
 

@@ -58,7 +58,7 @@ class Discretisation:
         self._make_spaces()
         self.state = fem.Function(self.space)
         self.held = _held_axes(body, held)
-        self.elimination: Ints | None = None  # linear.py keeps its order here, for all matrices of the body
+        self.band_order: Ints | None = None  # linear.py keeps its order here, for all matrices of the body
         self._hold()
 
     def _make_spaces(self) -> None:

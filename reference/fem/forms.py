@@ -38,7 +38,7 @@ _MOST = 1e200  # joules
 
 
 @dataclass(frozen=True, eq=False)
-class Load:
+class DiscreteLoad:
     """A load as unknowns.
 
     Args:
@@ -51,9 +51,16 @@ class Load:
     lift: Floats
     pressure: dict[str, float]
 
-    def scaled(self, factor: float) -> Load:
+    @staticmethod
+    def none(space: Discretisation) -> DiscreteLoad:
+        """No load."""
+        return DiscreteLoad(np.zeros(space.owned), np.zeros(space.owned), {})
+
+    def scaled(self, factor: float) -> DiscreteLoad:
         """The same load, `factor` times as strong."""
-        return Load(factor * self.dead, factor * self.lift, {name: factor * p for name, p in self.pressure.items()})
+        return DiscreteLoad(
+            factor * self.dead, factor * self.lift, {name: factor * p for name, p in self.pressure.items()}
+        )
 
 
 class Forms:
@@ -80,7 +87,6 @@ class Forms:
         self._body_force_form: Any = None
         self.direction = fem.Function(space.space)
         self.reactions = np.zeros(len(space.fixed))  # at held unknowns, where the residual was last asked for
-        self.derivatives: Any = None  # what sensitivity.py compiles, kept here from equilibrium to equilibrium
         self._compile()
 
     def parameter(self, name: str, value: Parameter) -> Any:
@@ -140,7 +146,7 @@ class Forms:
 
     # ------------------------------------------------------------------ loads
 
-    def load(self, loading: Loading) -> Load:
+    def load(self, loading: Loading) -> DiscreteLoad:
         """A load as unknowns."""
         space = self.space
         dead, lift = np.zeros(space.owned), np.zeros(space.owned)
@@ -158,7 +164,7 @@ class Forms:
             field[space.body.node_sets[name]] = values
         everywhere = space.unknowns("Loading.displacement", field)
         lift[space.fixed] = everywhere[space.fixed]
-        return Load(dead, lift, {name: value for name, value in loading.pressure.items() if value != 0.0})
+        return DiscreteLoad(dead, lift, {name: value for name, value in loading.pressure.items() if value != 0.0})
 
     def _body_forces(self, force: Floats) -> Floats:
         if self._body_force_form is None:
@@ -183,7 +189,7 @@ class Forms:
         assemble_vector(self._vector, list(compiled))
         return np.array(self._vector.array_r)
 
-    def _pressed(self, load: Load) -> list[_SurfaceForms]:
+    def _pressed(self, load: DiscreteLoad) -> list[_SurfaceForms]:
         pressed = []
         for name, pascals in load.pressure.items():
             forms = self.surface(name)
@@ -191,7 +197,7 @@ class Forms:
             pressed.append(forms)
         return pressed
 
-    def residual(self, unknowns: Floats, load: Load) -> Floats:
+    def residual(self, unknowns: Floats, load: DiscreteLoad) -> Floats:
         """Out-of-balance forces; at held unknowns their distance from where they should be."""
         self.space.set_state(unknowns)
         out = self.assembled(self._residual, *(s.pressure_form for s in self._pressed(load))) - load.dead
@@ -205,7 +211,7 @@ class Forms:
         self.space.set_state(unknowns)
         return self.assembled(self._residual)
 
-    def tangent(self, unknowns: Floats, load: Load, matrix: Any) -> None:
+    def tangent(self, unknowns: Floats, load: DiscreteLoad, matrix: Any) -> None:
         """The derivative of the residual into a matrix; held rows and columns are the identity's."""
         self.space.set_state(unknowns)
         if self._cell_sum is None:
@@ -229,11 +235,11 @@ class Forms:
         energy = scalar(self._energy, self.space.comm)
         return energy if energy < _MOST else np.inf
 
-    def potential(self, unknowns: Floats, load: Load) -> float:
+    def potential(self, unknowns: Floats, load: DiscreteLoad) -> float:
         """Strain energy minus the work of dead forces, joules."""
         return self.energy(unknowns) - self.space.dot(load.dead, unknowns)
 
-    def pressed(self, unknowns: Floats, load: Load) -> Floats:
+    def pressed(self, unknowns: Floats, load: DiscreteLoad) -> Floats:
         """What following pressures add to the residual."""
         surfaces = self._pressed(load)
         if not surfaces:
@@ -241,7 +247,7 @@ class Forms:
         self.space.set_state(unknowns)
         return self.assembled(*(s.pressure_form for s in surfaces))
 
-    def pressure_potential(self, unknowns: Floats, load: Load) -> float:
+    def pressure_potential(self, unknowns: Floats, load: DiscreteLoad) -> float:
         """Pressure times the volume between a surface, before and after, and the origin, joules."""
         total = 0.0
         for surface in self._pressed(load):
@@ -250,7 +256,7 @@ class Forms:
                 total += sign * scalar(surface.volume_form, self.space.comm)
         return total
 
-    def pressure_work(self, start: Floats, step: Floats, load: Load) -> float:
+    def pressure_work(self, start: Floats, step: Floats, load: DiscreteLoad) -> float:
         """Work of the following pressure along the straight way from `start` to `start + step`, joules.
 
         Simpson's rule is exact: the deformed area is quadratic in the displacement.
@@ -264,7 +270,7 @@ class Forms:
             work -= share / 6 * self.space.dot(self.assembled(*(s.pressure_form for s in pressed)), step)
         return work
 
-    def is_conservative(self, load: Load) -> bool:
+    def is_conservative(self, load: DiscreteLoad) -> bool:
         """True when the tangent of following pressures is symmetric: their surfaces are closed or held all round."""
         pressed = self._pressed(load)
         if not pressed:

@@ -51,7 +51,6 @@ class LinearSolver:
         matrix: the PETSc matrix.
         space: the body's discretisation.
         method: `band`, `mumps` or `multigrid`; `band` means MUMPS for a body that is not slender.
-        ksp: the solver to set up, SNES's own for instance; a new one if not given.
         symmetric: MUMPS factors L D L^T, which is cheaper than L U and counts negative pivots.
         turns: rotations cost next to no energy (elasticity), and not translations alone (Poisson's problem).
     """
@@ -61,14 +60,12 @@ class LinearSolver:
         matrix: Any,
         space: Discretisation,
         method: Method,
-        ksp: Any = None,
         symmetric: bool = True,
         turns: bool = True,
     ) -> None:
         self.matrix, self.method, self.symmetric = matrix, method, symmetric
         self._space, self._turns = space, turns
-        self.ksp = PETSc.KSP().create(space.comm) if ksp is None else ksp
-        self._owns = ksp is None
+        self.ksp = PETSc.KSP().create(space.comm)
         self._near_null: Any = None
         self._keys: list[str] = []
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
@@ -87,10 +84,10 @@ class LinearSolver:
     def _order(self) -> NDArray[np.int64] | None:
         """The order of elimination for a band, found once for a body; None where it is not slender."""
         space = self._space
-        if space.elimination is None:
+        if space.band_order is None:
             found = band_order(self.matrix, space.body.points, space.nodes)
-            space.elimination = np.empty(0, dtype=np.int64) if found is None else found
-        return space.elimination if len(space.elimination) else None
+            space.band_order = np.empty(0, dtype=np.int64) if found is None else found
+        return space.band_order if len(space.band_order) else None
 
     def _use_band(self, order: NDArray[np.int64]) -> None:
         """Band factors stay outside of PETSc, whose Python preconditioners crash when an interpreter ends."""
@@ -218,8 +215,7 @@ class LinearSolver:
             self._near_null.destroy()
         for key in self._keys:
             PETSc.Options().delValue(key)
-        if self._owns:
-            self.ksp.destroy()
+        self.ksp.destroy()
 
 
 class _Band:

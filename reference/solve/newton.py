@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from ..data.outcome import Iteration
 from ..fem.fenicsx import PETSc
-from ..fem.forms import Forms, Load
+from ..fem.forms import DiscreteLoad, Forms
 from .elimination import CellElimination
-from .linear import METHODS, LinearSolver, Method, chosen_method
+from .linear import METHODS, Method
+from .tangent import Tangent
 
 Floats = NDArray[np.float64]
 Search = Literal["energy", "full", "bt", "l2", "cp"]
@@ -93,67 +94,47 @@ class Attempt:
 
 
 class Newton:
-    """SNES for one body: its tangent, its factorisation and what happened in the present solve.
+    """SNES for one body, and what happened in the present solve.
 
     Args:
-        forms: energy, residual and tangent.
-        options: tolerance, limits, search, linear algebra.
+        forms: energy and residual.
+        tangent: stays owned by the caller.
+        options: tolerance, limits, search.
     """
 
-    def __init__(self, forms: Forms, options: NewtonOptions) -> None:
-        self.forms, self.space, self.options = forms, forms.space, options
+    def __init__(self, forms: Forms, tangent: Tangent, options: NewtonOptions) -> None:
+        self.forms, self.space, self.tangent, self.options = forms, forms.space, tangent, options
         self.search: Search = options.search
         if forms.space.mixed and options.search == "energy":
             self.search = "full"
-        self.matrix = forms.create_matrix()
-        self._residual, self._x = self.matrix.createVecLeft(), self.matrix.createVecRight()
-        self._snes: Any = None
+        self._residual, self._x = tangent.matrix.createVecLeft(), tangent.matrix.createVecRight()
         self._local: CellElimination | None = None
-        self.linear: LinearSolver
-        self.factored_at: tuple[Floats, dict[str, float]] | None = None
-        rest = np.zeros(self.space.owned)
-        forms.tangent(rest, Load(rest, rest, {}), self.matrix)  # the linear solver looks at its sparsity
-        self._make_solver(symmetric=True)
-        self.forget(self.matrix.norm(PETSc.NormType.NORM_INFINITY))
+        self._snes = self._make_snes()
+        self._find_scales()
         self.start_count()
 
-    def _make_solver(self, symmetric: bool) -> None:
-        if self._snes is not None:
-            self.linear.close()
-            self._snes.destroy()
+    def _make_snes(self) -> Any:
         snes = PETSc.SNES().create(self.space.comm)
         snes.setOptionsPrefix(f"softtwin_{next(_prefixes)}_")
         snes.setType("newtonls")
         snes.setFunction(self._function, self._residual)
-        snes.setJacobian(self._jacobian, self.matrix)
+        snes.setJacobian(self._jacobian, self.tangent.matrix)
         snes.setLineSearchPreCheck(self._precheck)
         snes.setConvergenceTest(self._test)
-        method = chosen_method(self.options.linear, self.space, symmetric)
-        self.linear = LinearSolver(self.matrix, self.space, method, snes.getKSP(), symmetric)
+        snes.setKSP(self.tangent.linear.ksp)
         _set_line_search(snes, self.search if self.search in ("bt", "l2", "cp") else "basic")
-        self._snes, self.symmetric = snes, symmetric
-        self.factored_at = None
+        return snes
 
-    def suit(self, load: Load) -> None:
-        """Change to L U where a following pressure makes the tangent unsymmetric, and back."""
-        symmetric = self.forms.is_conservative(load)
-        if symmetric != self.symmetric:
-            self._make_solver(symmetric)
+    def forget(self) -> None:
+        """The material has changed: tangent and scales are none of it any more."""
+        self.tangent.assemble_at_rest()
+        self._find_scales()
 
-    def forget(self, stiffness: float | None = None) -> None:
-        """The material has changed: the factorisation is none of it any more.
-
-        Args:
-            stiffness: norm of the tangent at rest, N/m; found anew if not given.
-        """
-        self.factored_at = None
-        if stiffness is None:
-            rest = np.zeros(self.space.owned)
-            self.forms.tangent(rest, Load(rest, rest, {}), self.matrix)
-            stiffness = self.matrix.norm(PETSc.NormType.NORM_INFINITY)
-        self._stiffness = float(stiffness)
+    def _find_scales(self) -> None:
+        """What rounding can be told by; the matrix is the tangent at rest."""
+        self._stiffness = float(self.tangent.matrix.norm(PETSc.NormType.NORM_INFINITY))
         nothing = np.zeros(self.space.owned)
-        at_rest = self.space.norm(self.forms.residual(nothing, Load(nothing, nothing, {})))
+        at_rest = self.space.norm(self.forms.residual(nothing, DiscreteLoad.none(self.space)))
         self._round_off = _EPSILONS * at_rest  # what rounding leaves of the stresses of a body at rest
         body, epsilon = self.space.body, float(_EPSILONS * np.finfo(float).eps)
         modulus = self.forms.stiffness_scale()
@@ -164,10 +145,10 @@ class Newton:
 
     def start_count(self) -> None:
         """Forget the counts and the trace of the last solve."""
-        self.factorisations = self.local_iterations = 0
+        self.tangent.factorisations = self.local_iterations = 0
         self.trace: list[Iteration] = []
 
-    def run(self, load: Load, start: Floats, factor: float = 1.0, eliminate: bool = False) -> Attempt:
+    def run(self, load: DiscreteLoad, start: Floats, factor: float = 1.0, eliminate: bool = False) -> Attempt:
         """Iterate from a start whose held unknowns are where they should be.
 
         Args:
@@ -176,7 +157,8 @@ class Newton:
             factor: part of the full load that this is, for the trace.
             eliminate: balance few cells alone where a step is cut, a few times; then give up.
         """
-        self.suit(load)
+        self.tangent.suit(load)
+        self._snes.setKSP(self.tangent.linear.ksp)
         self._load, self._factor = load, factor
         self._norms: list[float] = []
         self._search_failed = False
@@ -185,14 +167,14 @@ class Newton:
         self._reached: float | None = None  # potential where the last step led
         self._start_tolerance(load)
         self._x.array[:] = start
-        self.linear.loosen()
+        self.tangent.linear.loosen()
         with _interrupts():
             self._snes.solve(None, self._x)
         reason, iterations = int(self._snes.getConvergedReason()), self._snes.getIterationNumber()
         residual = float(self._norms[-1]) if self._norms else np.nan  # SNES gives up at once on a start inside out
         return Attempt(np.array(self._x.array_r), reason > 0, reason, iterations, residual)
 
-    def _start_tolerance(self, load: Load) -> None:
+    def _start_tolerance(self, load: DiscreteLoad) -> None:
         self._scale = self.space.norm(load.dead)
         if load.pressure:
             pressed = self.forms.residual(np.zeros(self.space.owned), load)
@@ -218,42 +200,22 @@ class Newton:
 
     def _jacobian(self, snes: Any, x: Any, tangent: Any, preconditioner: Any) -> None:
         if not self._keeps_factorisation():
-            self.assemble(np.array(x.array_r), self._load)
+            self.tangent.assemble(np.array(x.array_r), self._load)
 
     def _keeps_factorisation(self) -> bool:
         """Whether the last factorisation, at the rate of the last iteration, is soon enough at the tolerance."""
-        if not self.options.chord or self.factored_at is None or len(self._norms) < 2:
+        if not self.options.chord or not self.tangent.is_known or len(self._norms) < 2:
             return False
         rate = self._norms[-1] / self._norms[-2]
         return rate < 1.0 and self._absolute_tolerance >= rate**_CHORD_STEPS * self._norms[-1]
-
-    def assemble(self, unknowns: Floats, load: Load) -> None:
-        """The tangent at a state, unless it is there already."""
-        if self._is_at(unknowns, load):
-            return
-        self.factored_at = None
-        self.forms.tangent(unknowns, load, self.matrix)
-        self.factored_at = (unknowns.copy(), dict(load.pressure))
-        self.factorisations += 1
-
-    def _is_at(self, unknowns: Floats, load: Load) -> bool:
-        at = self.factored_at
-        here = at is not None and at[1] == load.pressure and np.array_equal(at[0], unknowns)
-        if self.space.comm.size > 1:
-            here = bool(self.space.comm.allreduce(int(here)) == self.space.comm.size)
-        return here
-
-    def linearise(self, unknowns: Floats, load: Load) -> None:
-        """The tangent at a state that was found, in the linear solver that suits its pressures."""
-        if not self._is_at(unknowns, load):
-            self.suit(load)
-            self.assemble(unknowns, load)
 
     def _test(self, snes: Any, iteration: int, norms: tuple[float, float, float]) -> int:
         reasons = PETSc.SNES.ConvergedReason
         norm = norms[2]
         self._norms.append(norm)
-        self.trace.append(Iteration(self._factor, iteration, norm, self._reached, self._length, self.factorisations))
+        self.trace.append(
+            Iteration(self._factor, iteration, norm, self._reached, self._length, self.tangent.factorisations)
+        )
         if not np.isfinite(norm):
             return reasons.DIVERGED_FNORM_NAN
         if norm <= self._absolute_tolerance:
@@ -274,7 +236,7 @@ class Newton:
 
     def _precheck(self, x: Any, y: Any) -> bool:
         """Shorten (or turn) the Newton direction; SNES then takes x - y whole, or its own search goes on from there."""
-        unknowns, step = np.array(x.array_r), self.linear.finished(np.array(y.array_r))
+        unknowns, step = np.array(x.array_r), self.tangent.linear.finished(np.array(y.array_r))
         if self.search in ("bt", "l2", "cp"):
             y.array[:] = step
             return True
@@ -354,8 +316,7 @@ class Newton:
 
     def close(self) -> None:
         """Free the PETSc objects."""
-        self.linear.close()
-        for item in (self._snes, self.matrix, self._residual, self._x):
+        for item in (self._snes, self._residual, self._x):
             item.destroy()
 
 

@@ -13,7 +13,7 @@ from softtwin.reference.data.materials import IncompressibleNeoHookean, Material
 from softtwin.reference.fem import assembly
 from softtwin.reference.fem.discretisation import Discretisation
 from softtwin.reference.fem.fenicsx import assemble_matrix, create_matrix
-from softtwin.reference.fem.forms import Forms, Load
+from softtwin.reference.fem.forms import DiscreteLoad, Forms
 
 CASES = [(kind, False) for kind in (*PLANE, *SPACE)] + [(kind, True) for kind in QUADRATIC]
 
@@ -30,7 +30,7 @@ def test_the_sum_of_cells_is_the_assembled_matrix(kind: str, mixed: bool, rng: n
 
     summed, inserted = forms.create_matrix(), create_matrix(forms.tangent_form)
     state = summed.stateGet()
-    forms.tangent(unknowns, Load(np.zeros(space.owned), np.zeros(space.owned), {}), summed)
+    forms.tangent(unknowns, DiscreteLoad(np.zeros(space.owned), np.zeros(space.owned), {}), summed)
     assemble_matrix(inserted, forms.tangent_form, space.conditions)
 
     assert summed.getAttr("values") is not None, "DOLFINx assembled both"
@@ -43,6 +43,6 @@ def test_a_body_too_large_for_its_cells_to_be_kept_is_left_to_dolfinx(monkeypatc
     monkeypatch.setattr(assembly, "_MOST_ENTRIES", 1000)
     forms = Forms(Discretisation(box("tetra", 2), False, {"x0": "xyz"}), NeoHookean(4500.0, 0.45))
     matrix = forms.create_matrix()
-    forms.tangent(np.zeros(forms.space.owned), Load(*np.zeros((2, forms.space.owned)), {}), matrix)
+    forms.tangent(np.zeros(forms.space.owned), DiscreteLoad(*np.zeros((2, forms.space.owned)), {}), matrix)
     assert matrix.getAttr("values") is None
     assert matrix.norm() > 0.0

@@ -12,7 +12,7 @@ from verification_cases import PLANE, SPACE, box
 
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.fem.discretisation import Discretisation
-from softtwin.reference.fem.forms import Forms, Load
+from softtwin.reference.fem.forms import DiscreteLoad, Forms
 from softtwin.reference.solve.elimination import CellElimination
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 
@@ -35,7 +35,7 @@ def test_the_step_of_a_patch_solves_the_rows_of_the_whole_tangent(kind: str, rng
     step = patch.step(unknowns, residual)
 
     matrix = forms.create_matrix()
-    forms.tangent(unknowns, Load(residual, np.zeros_like(residual), {}), matrix)
+    forms.tangent(unknowns, DiscreteLoad(residual, np.zeros_like(residual), {}), matrix)
     indptr, columns, values = matrix.getValuesCSR()
     rows = csr_matrix((values, columns, indptr))[patch.unknowns]
     assert 0 < len(patch.unknowns) < space.owned - len(space.fixed)

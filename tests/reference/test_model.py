@@ -180,6 +180,32 @@ def test_another_models_state_is_a_start(box: Body) -> None:
             np.testing.assert_allclose(warm.displacement, cold.displacement, atol=1e-7)
 
 
+@pytest.mark.parametrize("patient", [True, False])
+@pytest.mark.parametrize("wrong", [-1.0, 40.0], ids=["the other way", "inside out"])
+def test_a_proposal_that_is_worse_than_the_linear_response_is_left_aside(
+    box: Body, wrong: float, patient: bool
+) -> None:
+    """A network outside of what it learned must not keep the reference from its equilibrium, nor cost it iterations."""
+    forces = tip_force(box, 3.0)
+    with Problem(box, NeoHookean(5000.0, 0.4)) as problem:
+        model = ReferenceModel(problem, patient)
+        cold = model.solve(forces)
+
+        class Proposal:
+            displacement = wrong * cold.displacement * [1.0, -1.0, 1.0]
+
+        found = model.solve(forces, near=Proposal())
+    np.testing.assert_array_equal(found.displacement, cold.displacement)
+    assert found.equilibrium.iterations == cold.equilibrium.iterations
+
+
+@pytest.mark.parametrize("proposal", [np.zeros((3, 3)), np.nan], ids=["shape", "nan"])
+def test_a_proposal_is_checked(box: Body, proposal: object) -> None:
+    given = np.full_like(box.points, np.nan) if proposal is np.nan else proposal
+    with Problem(box, NeoHookean(5000.0, 0.4)) as problem, pytest.raises(ValueError, match=r"Problem\.proposal"):
+        problem.solve(tip_force(box), proposal=given)
+
+
 def test_an_impatient_model_refuses_without_load_steps(box: Body) -> None:
     with Problem(box, NeoHookean(5000.0, 0.4), NewtonOptions(max_iterations=6)) as problem:
         model = ReferenceModel(problem, patient=False)

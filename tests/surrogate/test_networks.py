@@ -12,6 +12,7 @@ import torch
 from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.architecture import Architecture, Differentiated, Network
 from softtwin.surrogate.mlp import Perceptron
+from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.reduced import AveragedNetwork, Reduced
 from softtwin.surrogate.registry import ARCHITECTURES
 from softtwin.surrogate.transolver import Transolver
@@ -113,3 +114,18 @@ def test_what_is_trained_is_what_predicts(lesson: Any, data: DataSet) -> None:
         else:
             expected = lesson.displacement_scale * lesson.network(lesson.forces[:1])[0].double().numpy()
     assert np.abs(inner - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+def test_fields_are_what_is_predicted(lesson: Any, data: DataSet) -> None:
+    """In metres and newtons at all nodes; over the images of a sample, turned back, their mean is the prediction."""
+    samples = data.samples("train")
+    count = len(samples)
+    images = torch.arange(lesson.sample_count // count) * count + 2
+    with torch.no_grad():
+        displacements, forces = lesson.fields(images)
+    expected = np.zeros_like(data.body.points)
+    expected[data.response.loaded] = samples.forces[2]
+    surrogate = Surrogate(data.body, lesson.maps(), lesson.trained(), {})
+    predicted = surrogate.solve(expected).displacement
+    assert np.abs(forces.numpy() - expected).max() < 1e-6 * np.abs(expected).max()
+    assert np.abs(displacements.mean(dim=0).numpy() - predicted).max() < 1e-5 * np.abs(predicted).max()
