@@ -20,6 +20,7 @@ from .model import Surrogate
 
 Floats = NDArray[np.float64]
 Adjoint = Callable[[Floats, Floats], Floats]
+Inverse = Callable[[Floats, Floats], Floats]
 
 _LEAST = 1e-300  # of a relative error, so that decibels stay numbers
 
@@ -178,6 +179,29 @@ def registration_cosines(surrogate: Surrogate, data: DataSet, samples: Samples, 
         cotangent[boundary] = (here - there)[boundary]
         cosines[i] = cosine(surrogate.solve(forces).pull(cotangent)[loaded], adjoint(here, cotangent)[loaded])
     return cosines
+
+
+def jacobian_errors(surrogate: Surrogate, data: DataSet, samples: Samples, inverse: Inverse) -> Floats:
+    """Relative errors |J - J*|_F / |J*|_F of the derivative by all loaded forces, (s,); J* = K(u*)^-1 at those columns.
+
+    The currency of derivative-informed operators (O'Leary-Roseberry et al. 2022, arXiv 2206.10745).
+
+    Args:
+        surrogate: what to judge.
+        data: the data set, for its body and loaded nodes.
+        samples: where to compare.
+        inverse: gives K(u)^-1 c, (3n, k), for columns c, (3n, k), and u, (n, 3); the reference knows it.
+    """
+    loaded = data.response.loaded
+    entries = (3 * loaded[:, None] + np.arange(3)).ravel()
+    columns = np.zeros((data.body.points.size, len(entries)))
+    columns[entries, np.arange(len(entries))] = 1.0
+    forces, errors = np.zeros_like(data.body.points), np.empty(len(samples))
+    for i, (load, displacement) in enumerate(zip(samples.forces, samples.displacements, strict=True)):
+        forces[loaded] = load
+        truth = inverse(columns, displacement)
+        errors[i] = np.linalg.norm(surrogate.solve(forces).push(columns) - truth) / np.linalg.norm(truth)
+    return errors
 
 
 def table(evaluations: Mapping[str, Evaluation]) -> str:

@@ -7,7 +7,15 @@ import pytest
 
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
-from softtwin.surrogate.evaluate import DEFINITIONS, cosine, evaluate, registration_cosines, spread, table
+from softtwin.surrogate.evaluate import (
+    DEFINITIONS,
+    cosine,
+    evaluate,
+    jacobian_errors,
+    registration_cosines,
+    spread,
+    table,
+)
 from softtwin.surrogate.model import Surrogate
 
 
@@ -79,3 +87,29 @@ def test_a_surrogate_of_another_body_is_refused(reduced: Surrogate, data: DataSe
     other = Surrogate(beam((4, 2, 2), (0.4, 0.2, 0.3)), reduced.maps, reduced.network, reduced.card)
     with pytest.raises(ValueError, match="another body"):
         evaluate(other, data)
+
+
+def test_errors_of_the_jacobian_are_those_of_its_columns(reduced: Surrogate, data: DataSet) -> None:
+    """Against one derivative at a time, and zero for a reference that is the surrogate itself."""
+    samples = data.samples("test", 2)
+    loaded = data.response.loaded
+    truth = np.random.default_rng(0).standard_normal((data.body.points.size, 3 * len(loaded)))
+    expected = []
+    for load in samples.forces:
+        forces = np.zeros_like(data.body.points)
+        forces[loaded] = load
+        state, missed = reduced.solve(forces), 0.0
+        for column, entry in enumerate((3 * loaded[:, None] + np.arange(3)).ravel()):
+            unit = np.zeros((data.body.points.size, 1))
+            unit[entry] = 1.0
+            missed += float(((state.push(unit)[:, 0] - truth[:, column]) ** 2).sum())
+        expected.append(np.sqrt(missed) / np.linalg.norm(truth))
+    np.testing.assert_allclose(jacobian_errors(reduced, data, samples, lambda c, u: truth), expected, rtol=1e-9)
+    own = {u.tobytes(): f for u, f in zip(samples.displacements, samples.forces, strict=True)}
+
+    def itself(columns: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+        forces = np.zeros_like(data.body.points)
+        forces[loaded] = own[displacement.tobytes()]
+        return reduced.solve(forces).push(columns)
+
+    assert jacobian_errors(reduced, data, samples, itself).max() == 0.0
