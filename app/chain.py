@@ -16,7 +16,7 @@ from .inputs import changes, load_plan, mesh_inputs, plan_entries, solved_data
 from .launch import generate_in_parallel
 from .register import NOTICE
 from .stages.generate import describe_data
-from .stages.learn import train_stage, validate_stage
+from .stages.learn import train_stage, training_plan, validate_stage
 from .stages.mesh import mesh_stage
 from .workspace import Workspace, open_workspace, write_whole
 
@@ -74,6 +74,7 @@ def make_twin(space: Workspace, path: Path, say: Say, again: bool = False) -> No
     Raises:
         ConfigError: equilibria were solved there on another mesh.
     """
+    training_plan(space.config.training)  # refused before the hour that the equilibria take, and not after it
     say(f"1/4 mesh: {space.config.body.source}")
     body = _mesh(space, say)
     say(f"    {len(body.points)} nodes, {len(body.cells)} cells, {len(body.fixed)} fixed, {1e3 * body.volume:.2f} l")

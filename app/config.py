@@ -130,8 +130,10 @@ class SolverSection(_Section):
 class TrainingSection(_Section):
     """The surrogate."""
 
-    architecture: Literal["reduced", "mlp"] = Field(
-        "reduced", description="reduced network, or the thesis's perceptron as yardstick"
+    architecture: Literal["reduced", "mlp", "umesh", "transolver"] = Field(
+        "reduced",
+        description="reduced network; yardsticks: the thesis's perceptron (mlp) and U-Mesh (umesh, regular grids only), "
+        "a transolver",
     )
     modes: Count = Field(64, description="displacement modes (POD) of the reduced network")
     width: Count = Field(256, description="width of its blocks")
@@ -140,6 +142,13 @@ class TrainingSection(_Section):
     )
     epochs: int = Field(0, ge=0, description="passes over the samples instead, whatever time they take; 0: by seconds")
     seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
+    settings: dict[str, int | float | bool | str] = Field(
+        default_factory=dict, description="further settings of the architecture by name: { depth = 3 }"
+    )
+    physics: dict[str, float] = Field(
+        default_factory=dict,
+        description="weights in the loss of energy, residual and data (1): { energy = 0.1 }; empty: the data alone",
+    )
 
 
 class RegistrationSection(_Section):

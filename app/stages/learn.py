@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -13,14 +16,15 @@ from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.evaluate import evaluate
-from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.physics import Physics
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.registry import ARCHITECTURES
 from softtwin.surrogate.train import train
 from softtwin.surrogate.twin import load, save
 
-from ..config import to_toml
+from ..config import ConfigError, TrainingSection, to_toml
 from ..inputs import check_trained, current_data, train_inputs, validate_inputs
 from ..workspace import Workspace, locked, timed, write_whole
 
@@ -45,14 +49,7 @@ def train_stage(space: Workspace, fresh: bool = False) -> Surrogate:
 def _train(space: Workspace, data: DataSet, fresh: bool) -> Surrogate:
     if fresh:
         shutil.rmtree(space.training, ignore_errors=True)
-    section = space.config.training
-    is_reduced = section.architecture == Reduced.name
-    plan = TrainingPlan(
-        architecture=Reduced(modes=section.modes, width=section.width) if is_reduced else Perceptron(),
-        seconds=section.seconds,
-        epochs=section.epochs or None,
-        seed=section.seed,
-    )
+    plan = training_plan(space.config.training)
     with timed(space, "train", train_inputs(space, data)):
         surrogate = with_discrepancy(with_domain(train(data, plan, space.training), data), data)
         save(surrogate, space.twin)
@@ -61,6 +58,36 @@ def _train(space: Workspace, data: DataSet, fresh: bool) -> Surrogate:
         os.replace(partial, space.twin / "body.vtu")
         write_whole(space.twin / "organ.toml", to_toml(space.config))
     return surrogate
+
+
+def training_plan(section: TrainingSection) -> TrainingPlan:
+    """What [training] asks for.
+
+    Raises:
+        ConfigError: settings that the architecture does not have, or values that it refuses; weights of physics that
+            there are not.
+    """
+    kind: Any = ARCHITECTURES[section.architecture]
+    own = {"modes": section.modes, "width": section.width} if kind is Reduced else {}
+    physics = _built("training.physics", Physics, section.physics) if section.physics else None
+    return TrainingPlan(
+        architecture=_built("training.settings", kind, {**own, **section.settings}),
+        seconds=section.seconds,
+        epochs=section.epochs or None,
+        seed=section.seed,
+        physics=physics,
+    )
+
+
+def _built(entry: str, kind: Any, values: Mapping[str, Any]) -> Any:
+    known = [field.name for field in fields(kind)]
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise ConfigError(f"{entry}: expected names among {', '.join(known)}, got {', '.join(unknown)}.")
+    try:
+        return kind(**values)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{entry}: {error}") from error
 
 
 def validate_stage(space: Workspace) -> str:
