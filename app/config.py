@@ -132,8 +132,8 @@ class TrainingSection(_Section):
 
     architecture: Literal["reduced", "mlp", "umesh", "transolver"] = Field(
         "reduced",
-        description="reduced network; yardsticks: the thesis's perceptron (mlp) and U-Mesh (umesh, regular grids only), "
-        "a transolver",
+        description="reduced network; as yardsticks the thesis's perceptron (mlp) and U-Mesh (umesh, on a regular "
+        "grid), and a transolver",
     )
     modes: Count = Field(64, description="displacement modes (POD) of the reduced network")
     width: Count = Field(256, description="width of its blocks")
