@@ -89,10 +89,12 @@ class Body:
         surfaces: named sets of boundary triangles as node numbers, (t, 3), for instance `observed`; of boundary edges,
             (t, 2), in the plane.
         inner: named inner surfaces (vessels, tumours) that the volume carries along.
+        fractions: filled share of each cell of a sparse grid, (m,), in (0, 1]: what is integrated over a cell counts
+            so much; None where all cells are full.
 
     Raises:
-        BodyError: shapes, index ranges, inverted cells, stray nodes, several components, `fixed` too small,
-            everything, or not on the boundary.
+        BodyError: shapes, index ranges, fractions out of range, inverted cells, stray nodes, several components,
+            `fixed` too small, everything, or not on the boundary.
     """
 
     points: Floats
@@ -100,6 +102,7 @@ class Body:
     node_sets: Mapping[str, Ints]
     surfaces: Mapping[str, Ints] = field(default_factory=dict)
     inner: Mapping[str, Surface] = field(default_factory=dict)
+    fractions: Floats | None = None
 
     def __post_init__(self) -> None:
         points = _checked_points("Body.points", self.points, (2, 3))
@@ -116,6 +119,8 @@ class Body:
         object.__setattr__(self, "node_sets", MappingProxyType(sets))
         object.__setattr__(self, "surfaces", MappingProxyType(surfaces))
         object.__setattr__(self, "inner", MappingProxyType(dict(self.inner)))
+        if self.fractions is not None:
+            object.__setattr__(self, "fractions", _checked_fractions(self.fractions, len(cells)))
         self._check_fixed()
 
     def _check_fixed(self) -> None:
@@ -227,12 +232,22 @@ class Body:
 
     @property
     def volume(self) -> float:
-        """Volume at rest, cubic metres; area, square metres, in the plane."""
+        """Volume at rest, cubic metres; area, square metres, in the plane.
+
+        Of a sparse grid the filled part, exact for its cells, whose edges are parallel.
+        """
+        if self.fractions is not None:
+            return float(self.fractions @ (corner_jacobians(self.points, self.corner_cells).mean(axis=1) * self._share))
         centred = self.points - self.points.mean(axis=0)
         if self.dimension == 3:
             return Surface(centred, self.boundary).volume
         a, b = centred[self.boundary[:, 0]], centred[self.boundary[:, 1]]
         return float(0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
+
+    @property
+    def _share(self) -> float:
+        """Volume of a cell with parallel edges, relative to the triple product of its edges."""
+        return {"triangle": 1 / 2, "tetrahedron": 1 / 6}.get(self.kind.shape, 1.0)
 
     @property
     def size(self) -> float:
@@ -241,9 +256,10 @@ class Body:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of points, cells and fixed nodes: two bodies with the same one have the same equilibria."""
+        """SHA-256 of points, cells, fixed nodes, fractions: two bodies with the same one have the same equilibria."""
         digest = hashlib.sha256()
-        for array in (self.points, self.cells, self.fixed):
+        fractions = () if self.fractions is None else (self.fractions,)
+        for array in (self.points, self.cells, self.fixed, *fractions):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
@@ -276,7 +292,7 @@ class Body:
         for name in self.surfaces:
             chosen = np.isin(_rows(outer[:, :width]), _rows(self.facets_of(name)))
             surfaces[name] = split_facets(outer[chosen], kind.pieces)
-        return Body(points, cells, sets, surfaces, self.inner)
+        return Body(points, cells, sets, surfaces, self.inner, self.fractions)
 
 
 def _checked_points(name: str, points: ArrayLike, dimensions: tuple[int, ...] = (3,)) -> Floats:
@@ -298,6 +314,15 @@ def _checked_indices(name: str, indices: ArrayLike, count: int) -> Ints:
     if array.size and (array.min() < 0 or array.max() >= count):
         raise BodyError(f"{name}: expected node numbers in 0..{count - 1}, got {array.min()}..{array.max()}.")
     return array
+
+
+def _checked_fractions(fractions: ArrayLike, count: int) -> Floats:
+    array = np.asarray(fractions, dtype=np.float64)
+    if array.shape != (count,):
+        raise BodyError(f"Body.fractions: expected one number for each of the {count} cells, got shape {array.shape}.")
+    if not ((array > 0.0) & (array <= 1.0)).all():
+        raise BodyError(f"Body.fractions: expected numbers in (0, 1], got {array.min()} to {array.max()}.")
+    return _frozen(array)
 
 
 def _checked_set(name: str, nodes: ArrayLike, count: int) -> Ints:

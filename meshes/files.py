@@ -43,6 +43,7 @@ _TEXT = (".txt", ".csv", ".xyz")
 _VTK_NODES = {kind.vtk: (kind.name, kind.nodes) for kind in KINDS.values()}
 _LAST_LINES = 100  # of a text cloud, to see how its numbers end
 _HEAD = 2048  # bytes in which a file says what it is
+_FRACTIONS = "fraction"
 _MARK = "softtwin body"
 _PLAIN = " :()[]/,=+@"
 _PREFIXES = ("node_set:", "surface:", "inner_points:", "inner_triangles:")
@@ -204,6 +205,8 @@ def write_body(path: str | Path, body: Body, fields: Mapping[str, ArrayLike] | N
     for name, surface in body.inner.items():
         _add(grid.GetFieldData(), f"inner_points:{name}", surface.points)
         _add(grid.GetFieldData(), f"inner_triangles:{name}", surface.triangles)
+    if body.fractions is not None:
+        _add(grid.GetCellData(), _FRACTIONS, body.fractions)
     _add(grid.GetFieldData(), _MARK, np.array([1]))
     _write(Path(path), grid)
 
@@ -231,7 +234,9 @@ def read_body(path: str | Path) -> Body:
     inner = {name: Surface(points[name], triangles[name]) for name in points}
     kind = next(kind for kind in KINDS.values() if kind.name in blocks)
     positions = vtk_to_numpy(grid.GetPoints().GetData())[:, : kind.dimension]
-    return Body(positions, blocks[kind.name], sets, surfaces, inner)
+    fractions = grid.GetCellData().GetArray(_FRACTIONS)
+    whole = None if fractions is None else vtk_to_numpy(fractions)
+    return Body(positions, blocks[kind.name], sets, surfaces, inner, whole)
 
 
 def read_fields(path: str | Path) -> dict[str, NDArray[Any]]:

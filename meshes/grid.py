@@ -40,9 +40,8 @@ class SparseGrid:
     a cell with its fraction.
 
     Args:
-        body: the hexahedra. Its `fixed` nodes are all nodes of the cells that hold a fixed vertex, so that such a
-            vertex cannot move at all; other sets likewise.
-        fractions: share of each cell's volume inside the surface, (m,), in (0, 1]; 1 for cells that are not cut.
+        body: the hexahedra, with their fractions. Its `fixed` nodes are all nodes of the cells that hold a fixed
+            vertex, so that such a vertex cannot move at all; other sets likewise.
         surface: the embedded surface at rest.
         weights: the row of a surface vertex holds the trilinear weights of its cell's 8 nodes, (v, n); they sum to 1.
         index: position of each cell in the enclosing grid, (m, 3).
@@ -52,7 +51,6 @@ class SparseGrid:
     """
 
     body: Body
-    fractions: Floats
     surface: Surface
     weights: csr_array
     index: Ints
@@ -68,9 +66,15 @@ class SparseGrid:
         return positions
 
     @property
+    def fractions(self) -> Floats:
+        """Share of each cell's volume inside the surface, (m,), in (0, 1]; 1 for cells that are not cut."""
+        assert self.body.fractions is not None
+        return self.body.fractions
+
+    @property
     def volume(self) -> float:
         """Volume inside the surface as the fractions have it, cubic metres."""
-        return float(self.fractions.sum() * np.prod(self.spacing))
+        return self.body.volume
 
     def carry(self, displacement: ArrayLike) -> Floats:
         """Displacements of the surface's vertices, (v, 3), metres.
@@ -148,9 +152,14 @@ def sparse_grid(
     points, cells, numbers = _kept_cells(kept)
     around = cells[_at(numbers, holders)]
     origin = middle - shape * edges / 2
-    return SparseGrid(
-        body=Body(origin + points * edges, cells, {name: around[members].ravel() for name, members in sets.items()}),
+    body = Body(
+        origin + points * edges,
+        cells,
+        {name: around[members].ravel() for name, members in sets.items()},
         fractions=np.maximum(share, smallest)[kept],
+    )
+    return SparseGrid(
+        body=body,
         surface=surface,
         weights=_weights(places - holders, around, len(points)),
         index=np.argwhere(kept),

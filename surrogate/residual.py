@@ -25,7 +25,7 @@ class ElasticBody(nn.Module):
     Args:
         body: the body, in space.
         material: strain energy; not mixed, and not an own `Energy`, which is written in UFL.
-        weights: factor of each cell's energy, (cells,), the part of the cell that is filled; 1 if not given.
+        weights: factor of each cell's energy, (cells,), in place of the body's own fractions.
         least_jacobian: for training: det F below it counts for more (`TorchAlgebra`), and nothing is NaN; 0 leaves all
             as it is.
 
@@ -48,7 +48,8 @@ class ElasticBody(nn.Module):
             raise ValueError(
                 f"ElasticBody.material: expected a compressible law of this package, got {type(material).__name__}."
             )
-        part = np.ones(len(body.cells)) if weights is None else np.asarray(weights, dtype=np.float64)
+        own = np.ones(len(body.cells)) if body.fractions is None else body.fractions
+        part = own if weights is None else np.asarray(weights, dtype=np.float64)
         if part.shape != (len(body.cells),):
             raise ValueError(f"ElasticBody.weights: expected shape ({len(body.cells)},), got {part.shape}.")
         self.material, self.nodes, self.least_jacobian = material, len(body.points), least_jacobian

@@ -14,6 +14,8 @@ from softtwin.meshes.body import Body
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+_AS_FULL = 1e-6  # fractions of cells that differ by less
+
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
@@ -43,7 +45,7 @@ def symmetries(body: Body, loaded: Ints, tolerance: float = 1e-6) -> tuple[Symme
     """The symmetries of a discrete body of isotropic material among axis swaps and mirrors; the identity comes first.
 
     Axes are those of the coordinates or, where these show none, the principal axes of the nodes. Nodes must land on
-    nodes, cells on cells, fixed on fixed and loaded on loaded nodes.
+    nodes, cells on cells that are as full, fixed on fixed and loaded on loaded nodes.
 
     Args:
         body: the body.
@@ -68,9 +70,11 @@ def symmetries(body: Body, loaded: Ints, tolerance: float = 1e-6) -> tuple[Symme
 def _maps(body: Body, loaded: Ints, nodes: Ints) -> bool:
     cells = np.sort(body.cells, axis=1)
     images = np.sort(nodes[body.cells], axis=1)
+    filled = np.ones(len(cells)) if body.fractions is None else body.fractions
     return (
         len(np.unique(nodes)) == len(nodes)
         and np.array_equal(np.sort(nodes[body.fixed]), body.fixed)
         and np.array_equal(np.sort(nodes[loaded]), np.sort(loaded))
         and np.array_equal(np.unique(cells, axis=0), np.unique(images, axis=0))
+        and np.allclose(filled[np.lexsort(cells.T)], filled[np.lexsort(images.T)], rtol=0.0, atol=_AS_FULL)
     )

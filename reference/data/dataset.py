@@ -120,6 +120,7 @@ class DataSet:
                 name: Surface(self._array(f"body/inner/{name}/points"), self._array(f"body/inner/{name}/triangles"))
                 for name in names["inner"]
             },
+            fractions=self._array("body/fractions") if names.get("fractions") else None,
         )
         if body.fingerprint != names["fingerprint"]:
             raise DataSetError(
@@ -311,10 +312,12 @@ def create(
         "sets": sorted(body.node_sets),
         "surfaces": sorted(body.surfaces),
         "inner": sorted(body.inner),
+        "fractions": body.fractions is not None,
         "fingerprint": body.fingerprint,
     }
     root = zarr.create_group(str(path), zarr_format=3, overwrite=True)
     arrays = {"body/points": body.points, "body/cells": body.cells}
+    arrays |= {} if body.fractions is None else {"body/fractions": body.fractions}
     arrays |= {f"body/sets/{name}": nodes for name, nodes in body.node_sets.items()}
     arrays |= {f"body/surfaces/{name}": triangles for name, triangles in body.surfaces.items()}
     for name, surface in body.inner.items():

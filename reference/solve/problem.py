@@ -44,7 +44,7 @@ class Problem:
         options: tolerance, limits and method.
         held: axes whose displacement is prescribed at named node sets, zero unless a load says otherwise:
             `{"fixed": "xyz", "symmetry": "x"}`; `{"fixed": "xyz"}` if not given.
-        weights: filled part of each cell, (cells,), in (0, 1], of a sparse grid.
+        weights: factor of each cell's energy, (cells,), in (0, 1], in place of the body's own fractions.
         quadrature: polynomial degree that the quadrature is exact for; the least that is safe if not given.
         comm: communicator that shares the mesh; each rank on its own if not given.
 

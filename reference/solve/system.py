@@ -31,7 +31,7 @@ class System:
         body: the body.
         material: strain energy.
         held: axes held at each named node set.
-        weights: filled part of each cell, (cells,), in (0, 1]; None for 1.
+        weights: filled part of each cell, (cells,), in (0, 1]; None for the body's own.
         quadrature: polynomial degree that the quadrature is exact for; None for the least that is safe.
         method: linear algebra.
         comm: communicator that shares the mesh.
@@ -57,7 +57,7 @@ class System:
             )
         self.body, self.held = body, dict(held)
         self.space = Discretisation(body, material.is_mixed, self.held, comm)
-        checked = None if weights is None else _checked_weights(weights, len(body.cells))
+        checked = body.fractions if weights is None else _checked_weights(weights, len(body.cells))
         self.forms = Forms(self.space, material, checked, quadrature)
         self.tangent = Tangent(self.forms, method)
 

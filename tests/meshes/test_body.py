@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -127,3 +129,22 @@ def test_surfaces_are_checked(body: Body) -> None:
         Body(body.points, body.cells, {"fixed": body.fixed}, {"seen": np.zeros((2, 4), dtype=int)})
     with pytest.raises(BodyError, match=r"Surface\.triangles: expected shape \(t, 3\) with t >= 1"):
         Surface(body.points, np.zeros((0, 3), dtype=int))
+
+
+def test_fractions_are_part_of_a_body(body: Body) -> None:
+    """They fill the volume, make another body of it, stay with what is derived from it, and are checked."""
+    filled = np.linspace(0.1, 1.0, len(body.cells))
+    sparse = replace(body, fractions=filled)
+    cell = body.volume / len(body.cells)
+    assert sparse.volume == pytest.approx(cell * filled.sum()) and replace(
+        body, fractions=0.0 * filled + 1.0
+    ).volume == (pytest.approx(body.volume))
+    assert sparse.fingerprint != body.fingerprint
+    for derived in (sparse.quadratic(), sparse.with_sets(zone=[0])):
+        np.testing.assert_array_equal(derived.fractions, filled)
+    assert sparse.fractions is not None and not sparse.fractions.flags.writeable
+    with pytest.raises(BodyError, match=rf"Body.fractions: expected one number for each of the {len(filled)} cells"):
+        replace(body, fractions=filled[1:])
+    for wrong in (0.0, 1.5, np.nan):
+        with pytest.raises(BodyError, match=r"Body.fractions: expected numbers in \(0, 1\]"):
+            replace(body, fractions=np.r_[wrong, filled[1:]])

@@ -212,6 +212,15 @@ def test_a_body_comes_back_bit_for_bit(kind: str, tmp_path: Path, ball: Surface)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["body.vtu"]
 
 
+def test_fractions_come_back_bit_for_bit(tmp_path: Path) -> None:
+    plain = beam((3, 2, 2), (0.3, 0.2, 0.1))
+    sparse = Body(plain.points, plain.cells, plain.node_sets, fractions=np.linspace(0.1, 1.0, len(plain.cells)) / 3)
+    write_body(tmp_path / "body.vtu", sparse)
+    _equal(sparse, read_body(tmp_path / "body.vtu"))
+    write_body(tmp_path / "plain.vtu", plain)
+    assert read_body(tmp_path / "plain.vtu").fractions is None
+
+
 def test_the_liver_phantom_comes_back_bit_for_bit(tmp_path: Path, liver: Body) -> None:
     write_body(tmp_path / "liver.vtu", liver)
     _equal(liver, read_body(tmp_path / "liver.vtu"))

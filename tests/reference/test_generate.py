@@ -167,6 +167,31 @@ def test_another_plan_or_body_is_refused_by_name(undisturbed: DataSet) -> None:
         generate(undisturbed.path, beam((5, 2, 2), (0.6, 0.2, 0.2)), PLAN)
 
 
+def test_a_sparse_grid_is_carried_from_the_body_to_the_data_and_its_physics(tmp_path: Path) -> None:
+    """Cells cut in half count half: in the equilibria, in what is stored, and in torch."""
+    torch = pytest.importorskip("torch", reason="torch is absent")
+    from softtwin.meshes.checks import compacted
+    from softtwin.meshes.grid import sparse_grid
+    from softtwin.surrogate.residual import ElasticBody
+
+    surface = compacted(beam((3, 1, 1), (0.6, 0.2, 0.2), "tetrahedron").boundary_surface)
+    left = np.flatnonzero(np.isclose(surface.points[:, 0], 0.0))
+    grid = sparse_grid(surface, left, spacing=0.08)
+    assert grid.fractions.min() < 0.6 and grid.body.volume == pytest.approx(0.6 * 0.2 * 0.2, rel=0.01)
+    plan = replace(PLAN, samples={"train": 3, "validation": 3, "test": 3})
+    data = generate(tmp_path / "data.zarr", grid.body, plan)
+    assert data is not None and np.array_equal(data.body.fractions, grid.fractions)
+    samples = data.samples("train")
+    forces = np.zeros((len(samples), *data.body.points.shape))
+    forces[:, data.response.loaded] = samples.forces
+    given = torch.from_numpy(samples.displacements), torch.from_numpy(forces)
+    assert float(ElasticBody(data.body, data.material).residual(*given).max()) < 1e-7
+    full = replace(data.body, fractions=None)
+    assert float(ElasticBody(full, data.material).residual(*given).min()) > 0.05
+    with pytest.raises(DataSetError, match="differs in the body"):
+        generate(tmp_path / "data.zarr", full, plan)
+
+
 def test_another_zone_on_the_same_nodes_is_another_body(tmp_path: Path) -> None:
     zoned = replace(PLAN, loads=replace(PLAN.loads, zones=("tip",)), samples={"train": 1, "validation": 1, "test": 1})
     generate(tmp_path / "data.zarr", body(), zoned)

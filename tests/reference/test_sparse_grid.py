@@ -28,7 +28,7 @@ def bent(grid: SparseGrid, newtons: float = 0.6) -> np.ndarray:
     end = np.isclose(x, x.max())
     forces = np.zeros_like(grid.surface.points)
     forces[end, 2] = newtons / end.sum()
-    with Problem(grid.body, MATERIAL, weights=grid.fractions) as problem:
+    with Problem(grid.body, MATERIAL) as problem:
         state = problem.solve(grid.spread(forces))
         assert state.is_stable
     return grid.carry(state.displacement)[end].mean(axis=0)

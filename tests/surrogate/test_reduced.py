@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -52,6 +54,14 @@ def test_a_turned_beam_keeps_the_symmetries_that_its_principal_axes_show() -> No
     turn = turn @ np.roll(np.roll(turn, 1, axis=0), 1, axis=1)
     turned = Body(body.points @ turn.T, body.cells, {"fixed": body.fixed})
     assert len(symmetries(turned, _loaded(turned))) == 4
+
+
+def test_cells_that_are_not_as_full_break_the_symmetries_that_swap_them() -> None:
+    body = beam((4, 2, 2), (0.4, 0.2, 0.2))
+    middles = body.points[body.cells].mean(axis=1)
+    alike = replace(body, fractions=np.where(middles[:, 0] > 0.3, 0.5, 1.0))
+    thinner_above = replace(body, fractions=np.where(middles[:, 2] > 0.1, 0.5, 1.0))
+    assert [len(symmetries(b, _loaded(b))) for b in (body, alike, thinner_above)] == [8, 8, 2]
 
 
 def test_loads_on_one_side_leave_only_the_symmetries_of_that_side() -> None:
