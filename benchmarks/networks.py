@@ -184,13 +184,17 @@ def show(key: str, figures: dict[str, Any]) -> None:
     others = [f"{kind}: e {1e3 * f['nodal_error']['mean']:.3f} mm" for kind, f in figures.items() if isinstance(f, dict)
               and "nodal_error" in f and kind != figures["learned_from"]]  # fmt: skip
     residual = "-" if sound["residual"] is None else f"{sound['residual']['median']:.2g}"
-    print(
-        f"{key:55} e {1e3 * own['nodal_error']['mean']:.4f} mm, relative {100 * own['relative_error']['median']:.3f} "
-        f"(95 % {100 * own['relative_error']['p95']:.2f}) %, cos {own['gradient_cosine']['mean']:.5f}, Jacobian "
-        f"{100 * own['jacobian_error']['mean']:.1f} %, residual {residual}, inside out "
-        f"{sound['inside_out']}, indefinite {sound['indefinite']} of {sound['samples']}, f(0) {1e3 * sound['at_rest']:.3f} mm; {'; '.join(others)}",
-        flush=True,
-    )
+    parts = [
+        f"{key:55} e {1e3 * own['nodal_error']['mean']:.4f} mm",
+        f"relative {100 * own['relative_error']['median']:.3f} (95 % {100 * own['relative_error']['p95']:.2f}) %",
+        f"cos {own['gradient_cosine']['mean']:.5f}",
+        f"Jacobian {100 * own['jacobian_error']['mean']:.1f} %",
+        f"residual {residual}",
+        f"of {sound['samples']} inside out {sound['inside_out']}, indefinite {sound['indefinite']}",
+        f"f(0) {1e3 * sound['at_rest']:.3f} mm",
+        *others,
+    ]
+    print("; ".join(parts), flush=True)
 
 
 def main() -> None:
