@@ -69,7 +69,7 @@ class Evaluation:
         relative_error: dimensionless.
         signal_to_noise: decibels (Odot 2023, Tables 5.1 and 5.2, names an SNR and does not define it).
         displacement_norm: metres.
-        gradient_cosine: dimensionless.
+        gradient_cosine: dimensionless; None where the data hold no gradients.
         prediction_ms: median wall time of `solve` for one sample, milliseconds, in double precision on the CPU.
         threads: limit of BLAS threads that the time was taken under.
     """
@@ -83,7 +83,7 @@ class Evaluation:
     relative_error: Spread
     signal_to_noise: Spread
     displacement_norm: Spread
-    gradient_cosine: Spread
+    gradient_cosine: Spread | None
     prediction_ms: float
     threads: str
 
@@ -127,7 +127,7 @@ def evaluate(surrogate: Surrogate, data: DataSet, split: Split = "test", limit: 
         relative_error=spread(relative),
         signal_to_noise=spread(-20.0 * np.log10(np.clip(relative, _LEAST, 1.0 / _LEAST))),
         displacement_norm=spread(np.linalg.norm(samples.displacements, axis=(1, 2))),
-        gradient_cosine=spread(cosines),
+        gradient_cosine=spread(cosines) if data.has_gradients else None,
         prediction_ms=1e3 * float(np.median(times)),
         threads=os.environ.get("OPENBLAS_NUM_THREADS") or os.environ.get("OMP_NUM_THREADS") or "not limited",
     )
@@ -215,6 +215,8 @@ def table(evaluations: Mapping[str, Evaluation]) -> str:
     lines = [head]
     for name, evaluation in evaluations.items():
         for field, symbol, _, unit in DEFINITIONS:
+            if getattr(evaluation, field) is None:
+                continue
             values = asdict(getattr(evaluation, field)).values()
             figures = " ".join(f"{value:10.6f}" if field == "gradient_cosine" else f"{value:10.3e}" for value in values)
             lines.append(f"{name:{width}}  {symbol:8} {figures}  {'' if unit == '1' else unit}".rstrip())

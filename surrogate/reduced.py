@@ -41,7 +41,7 @@ class Reduced:
         modes: POD modes at most.
         width: width of its blocks.
         depth: number of its blocks.
-        sobolev: weight of the gradient's error in the loss; 0 leaves it out.
+        sobolev: weight of the gradient's error in the loss; 0 leaves it out, as data without gradients do.
         symmetries: use the body's symmetries, if it has any: learn from symmetric images too, and average over them
             when predicting.
 
@@ -263,7 +263,7 @@ class ReducedLesson(nn.Module):
     def __init__(self, data: DataSet, train: Samples, validation: Samples, settings: Reduced) -> None:
         super().__init__()
         self.response = data.response
-        self.sobolev = settings.sobolev
+        self.sobolev = settings.sobolev if data.has_gradients else 0.0
         loaded = data.response.loaded
         group = symmetries(data.body, loaded) if settings.symmetries else (identity(data.body),)
         self._rms = float(np.sqrt(np.mean(_sizes(train.displacements) ** 2)))

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from scipy.sparse import coo_matrix, csr_matrix
 from torch import Tensor, nn
 
 from softtwin.meshes.body import Body
@@ -100,6 +101,33 @@ class ElasticBody(nn.Module):
         shares = torch.einsum("scqij,cqkj,cq->scki", stress, self.gradients, self.volumes)
         forces = torch.zeros(len(F), self.nodes, 3, dtype=F.dtype, device=F.device)
         return forces.index_add(1, self.cells.reshape(-1), shares.reshape(len(F), -1, 3))
+
+    def cell_stiffnesses(self, displacement: Tensor) -> Tensor:
+        """Tangents of the cells at one state, (n, 3), metres: (cells, 3k, 3k), N/m, node by node."""
+        nodal = displacement[self.cells]
+        forces = torch.func.grad(lambda u: self._cell_energy(u).sum())
+        width = nodal.shape[1] * 3
+        columns = []
+        for entry in range(width):
+            unit = torch.zeros(width, dtype=nodal.dtype, device=nodal.device)
+            unit[entry] = 1.0
+            way = unit.reshape(1, -1, 3).expand_as(nodal)
+            columns.append(torch.func.jvp(forces, (nodal,), (way,))[1].flatten(1))
+        return torch.stack(columns, dim=2)
+
+    def stiffness(self, displacement: Tensor) -> csr_matrix:
+        """The tangent at one state, (n, 3), metres: (3n, 3n), N/m, fixed nodes included, no following pressure."""
+        blocks = self.cell_stiffnesses(displacement).detach().double().cpu().numpy()
+        unknowns = (3 * self.cells[:, :, None].cpu().numpy() + np.arange(3)).reshape(len(blocks), -1)
+        rows, columns = np.broadcast_arrays(unknowns[:, :, None], unknowns[:, None, :])
+        size = 3 * self.nodes
+        return coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size)).tocsr()
+
+    def _cell_energy(self, nodal: Tensor) -> Tensor:
+        """Strain energy of each cell, (cells,), for its nodal displacements, (cells, k, 3)."""
+        unit = torch.eye(3, dtype=nodal.dtype, device=nodal.device)
+        F = unit + torch.einsum("cki,cqkj->cqij", nodal, self.gradients)
+        return (self._density(F) * self.volumes).sum(dim=1)
 
     def residual(self, displacement: Tensor, forces: Tensor) -> Tensor:
         """Out-of-balance forces at the free nodes relative to the forces there, |R(u) - b| / |b|, (s,).

@@ -149,6 +149,11 @@ class DataSet:
         return schema.Sizes(len(self.response.loaded), len(self.body.points), len(self.shapes))
 
     @property
+    def has_gradients(self) -> bool:
+        """Whether the adjoints of samples are those of a solver: those of data from elsewhere are zeros."""
+        return bool(self.header.get("gradients", True))
+
+    @property
     def material(self) -> Material:
         """Strain energy of the equilibria.
 

@@ -6,10 +6,17 @@ from pathlib import Path
 
 import follow_a_stream
 import own_forward_model
+import own_simulator
 import pytest
 import register_a_cloud
 
-EXAMPLES = {"register_a_cloud", "follow_a_stream", "own_forward_model"}
+EXAMPLES = {
+    "register_a_cloud",
+    "follow_a_stream",
+    "own_forward_model",
+    "own_simulator",
+    "train_through_equilibria",
+}
 
 
 def test_every_example_is_tested_here() -> None:
@@ -32,3 +39,18 @@ def test_follow_a_stream(small_quickstart: Path, capsys) -> None:
 def test_own_forward_model(capsys) -> None:
     assert own_forward_model.main() == pytest.approx(0.0, abs=0.02)  # half a millimetre of noise on 40 mm of movement
     assert "accepted" in capsys.readouterr().out
+
+
+def test_own_simulator(tmp_path: Path, capsys) -> None:
+    """A linear map of the same samples is off by a fifth: the simulator stiffens twofold."""
+    assert own_simulator.main(tmp_path) < 0.05
+    assert "accepted test samples averaged" in capsys.readouterr().out
+
+
+@pytest.mark.fenicsx
+def test_train_through_equilibria(capsys) -> None:
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    import train_through_equilibria
+
+    assert train_through_equilibria.main() < 0.1
+    assert capsys.readouterr().out.count("% off") == 5

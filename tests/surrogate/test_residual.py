@@ -60,6 +60,10 @@ def test_energy_and_forces_are_the_references(law: Material, kind: str, degree: 
     physics = ElasticBody(body, law, weights)
     energies, forces = physics.energy(batch(*fields)).numpy(), physics.internal_forces(batch(*fields)).numpy()
     with Problem(body, law, weights=weights) as problem:
+        stiffness = problem.stiffness(fields[0])
+        free = np.repeat(np.isin(np.arange(len(body.points)), body.free), 3)
+        found = physics.stiffness(torch.from_numpy(fields[0]))[free][:, free]
+        assert abs(found - stiffness[free][:, free]).max() < 1e-10 * abs(stiffness).max()
         for field, energy, force in zip(fields, energies, forces, strict=True):
             expected = problem.internal_forces(field)
             assert energy == pytest.approx(problem.energy(field), rel=1e-10)
