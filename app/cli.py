@@ -109,6 +109,20 @@ def validate(configuration: Path) -> None:
 
 @softtwin.command()
 @click.argument("twin", type=_EXISTING)
+@click.option("--output", type=_PATH, help="Folder to write; TWIN/onnx if not given.")
+@click.option("--directions", default=64, show_default=True, type=click.IntRange(1), help="Of force in the Jacobian.")
+def export(twin: Path, output: Path | None, directions: int) -> None:
+    """Write the surrogate of TWIN as graphs for other programs (ONNX and torch.export): displacement and Jacobian."""
+    from softtwin.meshes.files import read_body
+    from softtwin.surrogate.export import export as write_graphs
+    from softtwin.surrogate.twin import load
+
+    folder = write_graphs(load(twin, read_body(twin / "body.vtu")), output or twin / "onnx", directions)
+    click.echo(f"graphs written to {folder}")
+
+
+@softtwin.command()
+@click.argument("twin", type=_EXISTING)
 @click.argument("clouds", nargs=-1, required=True)
 @click.option("--model", type=click.Choice(["surrogate", "reference"]), help="Forward model.")
 @click.option("--zone", help="Node set whose nodes may carry force; '' for all loaded nodes.")

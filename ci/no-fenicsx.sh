@@ -23,7 +23,7 @@ if [ ! -f "$STAMP" ] || [ "$(cat "$STAMP")" != "$WANTED" ]; then
     "$SYSTEM_PYTHON" -m venv "$BARE"
     "$BARE/bin/python" -m pip install -q -c ci/constraints.txt "$WHEEL[torch]"
     (cd / && "$BARE/bin/python" "$ROOT/ci/import_fast_path.py" --without-mesh)
-    "$BARE/bin/python" -m pip install -q -c ci/constraints.txt "$WHEEL[torch,mesh,app,test]"
+    "$BARE/bin/python" -m pip install -q -c ci/constraints.txt "$WHEEL[torch,mesh,app,onnx,test]"
     echo "$WANTED" >"$STAMP"
 fi
 "$BARE/bin/python" -m pip install -q --no-deps --force-reinstall "$WHEEL"

@@ -135,7 +135,7 @@ class TransolverNetwork(FieldNetwork):
 
     def moved(self, forces: Tensor) -> Tensor:
         """Displacement of all nodes, (s, n, 3), for forces at the loaded ones, (s, l, 3), both scaled."""
-        count = len(forces)
+        count = forces.shape[0]  # len() would fix the size of an exported batch
         given = forces.new_zeros(count, len(self.places), 3).index_copy(1, self.entries, forces)
         x = self.enter(torch.cat([self.places.expand(count, -1, -1), given], dim=2))
         displacement: Tensor = self.leave(self.last(self.blocks(x)))

@@ -144,7 +144,7 @@ class UMeshNetwork(FieldNetwork):
 
     def moved(self, forces: Tensor) -> Tensor:
         """Displacement of all nodes, (s, n, 3), for forces at the loaded ones, (s, l, 3), both scaled."""
-        count, numbers = len(forces), self.numbers
+        count, numbers = forces.shape[0], self.numbers  # len() would fix the size of an exported batch
         flat = forces.new_zeros(count, 3, int(np.prod(self._padded)))
         values = flat.index_copy(2, numbers[self.entries], forces.mT).reshape(count, 3, *self._padded)
         passed = []

@@ -16,6 +16,7 @@ EXAMPLES = {
     "own_forward_model",
     "own_simulator",
     "train_through_equilibria",
+    "run_exported_graphs",
 }
 
 
@@ -54,3 +55,15 @@ def test_train_through_equilibria(capsys) -> None:
 
     assert train_through_equilibria.main() < 0.1
     assert capsys.readouterr().out.count("% off") == 5
+
+
+def test_run_exported_graphs(small_quickstart: Path, capsys) -> None:
+    """After `softtwin export`, which writes into the twin's folder."""
+    pytest.importorskip("onnxruntime", reason="onnxruntime is absent")
+    import run_exported_graphs
+
+    from softtwin.app.cli import main
+
+    main(["export", str(small_quickstart / "twin"), "--directions", "5"])
+    assert run_exported_graphs.main(small_quickstart / "twin") < 0.05
+    assert "graphs written to" in capsys.readouterr().out
