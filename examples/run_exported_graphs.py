@@ -3,8 +3,8 @@
     softtwin export softtwin-quickstart/twin
     python examples/run_exported_graphs.py softtwin-quickstart/twin
 
-The second graph gives the displacement and its whole derivative at once, for coefficients of the directions of force that
-move the body most: enough for a registration in any language that has an ONNX runtime.
+The second graph gives the displacement and its whole derivative at once, for coefficients of the directions of force
+that move the body most: enough for a registration in any language that has an ONNX runtime.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from softtwin.surrogate.exported import ExportedTwin
 
 
 def main(twin: Path) -> float:
-    """How far the derivative's prediction for one per cent more load is from the graph's own, relative to the change."""
+    """How far the derivative is off for one per cent more load, relative to the change that the graph itself gives."""
     graphs = ExportedTwin(twin / "onnx", twin)
     coefficients = np.zeros(graphs.directions.shape[1])
     coefficients[0] = 0.5  # newtons

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import follow_a_stream
@@ -57,13 +58,14 @@ def test_train_through_equilibria(capsys) -> None:
     assert capsys.readouterr().out.count("% off") == 5
 
 
-def test_run_exported_graphs(small_quickstart: Path, capsys) -> None:
+def test_run_exported_graphs(small_quickstart: Path, tmp_path: Path, capsys) -> None:
     """After `softtwin export`, which writes into the twin's folder."""
     pytest.importorskip("onnxruntime", reason="onnxruntime is absent")
     import run_exported_graphs
 
     from softtwin.app.cli import main
 
-    main(["export", str(small_quickstart / "twin"), "--directions", "5"])
-    assert run_exported_graphs.main(small_quickstart / "twin") < 0.05
+    twin = Path(shutil.copytree(small_quickstart / "twin", tmp_path / "twin"))
+    main(["export", str(twin), "--directions", "5"])
+    assert run_exported_graphs.main(twin) < 0.05
     assert "graphs written to" in capsys.readouterr().out
