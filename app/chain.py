@@ -10,6 +10,7 @@ from softtwin.meshes.files import read_body
 from softtwin.reference.data.dataset import DataSet, DataSetError, differences
 from softtwin.reference.data.samplers import check_loads
 from softtwin.surrogate.checkpoint import CheckpointError
+from softtwin.surrogate.plan import Device
 
 from .config import Config, ConfigError, to_toml
 from .inputs import changes, load_plan, mesh_inputs, plan_entries, solved_data
@@ -23,7 +24,7 @@ from .workspace import Workspace, open_workspace, write_whole
 Say = Callable[[str], None]
 
 
-def build_twin(config: Config, output: Path, say: Say, again: bool = False) -> Workspace:
+def build_twin(config: Config, output: Path, say: Say, again: bool = False, device: Device = "auto") -> Workspace:
     """Mesh, generate, train and validate.
 
     Args:
@@ -31,12 +32,13 @@ def build_twin(config: Config, output: Path, say: Say, again: bool = False) -> W
         output: folder of everything that is made.
         say: prints a line.
         again: throw away equilibria that were solved there before.
+        device: where to train.
 
     Raises:
         ConfigError: equilibria were solved there with another configuration or other files.
     """
     space = prepare(config, output, again)
-    make_twin(space, output / "organ.toml", say, again)
+    make_twin(space, output / "organ.toml", say, again, device)
     say(f"\ntwin: {space.twin}")
     say(f"next: softtwin register {space.twin} CLOUDS...   and: softtwin report {output / 'organ.toml'}")
     say(NOTICE)
@@ -62,7 +64,7 @@ def prepare(config: Config, output: Path, again: bool = False) -> Workspace:
     return open_workspace(output / "organ.toml")
 
 
-def make_twin(space: Workspace, path: Path, say: Say, again: bool = False) -> None:
+def make_twin(space: Workspace, path: Path, say: Say, again: bool = False, device: Device = "auto") -> None:
     """The stages up to the validated twin, each only where its result is missing or of other inputs.
 
     Args:
@@ -70,11 +72,12 @@ def make_twin(space: Workspace, path: Path, say: Say, again: bool = False) -> No
         path: its configuration file, for the ranks that mpirun starts.
         say: prints a line.
         again: throw away equilibria that were solved before.
+        device: where to train.
 
     Raises:
         ConfigError: equilibria were solved there on another mesh.
     """
-    training_plan(space.config.training)  # refused before the hour that the equilibria take, and not after it
+    training_plan(space.config.training, device)  # refused before the hour that the equilibria take, and not after it
     say(f"1/4 mesh: {space.config.body.source}")
     body = _mesh(space, say)
     say(f"    {len(body.points)} nodes, {len(body.cells)} cells, {len(body.fixed)} fixed, {1e3 * body.volume:.2f} l")
@@ -84,10 +87,10 @@ def make_twin(space: Workspace, path: Path, say: Say, again: bool = False) -> No
     _generate(space, body, path, say, again)
     say("3/4 train: the surrogate")
     try:
-        train_stage(space)
+        train_stage(space, device=device)
     except CheckpointError as error:
         say(f"    from the start: {str(error).partition(';')[0].removeprefix('train.folder: ')}")
-        train_stage(space, fresh=True)
+        train_stage(space, fresh=True, device=device)
     say("4/4 validate: held-out errors")
     say(validate_stage(space))
 

@@ -25,6 +25,13 @@ from .register import NOTICE
 _FOR_DEVELOPERS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning, ImportWarning, ResourceWarning)
 _PATH = click.Path(path_type=Path)
 _EXISTING = click.Path(exists=True, path_type=Path)
+_DEVICE = click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="Where to train; auto: on a GPU where torch sees one.",
+)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -87,13 +94,14 @@ def generate(configuration: Path, redo: tuple[int, ...], again: bool) -> None:
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
 @click.option("--fresh", is_flag=True, help="Throw earlier checkpoints away instead of going on from them.")
-def train(configuration: Path, fresh: bool) -> None:
+@_DEVICE
+def train(configuration: Path, fresh: bool, device: Any) -> None:
     """Train the surrogate of CONFIGURATION on its data set and write the twin. Goes on from the last checkpoint."""
     from .stages.learn import train_stage
     from .workspace import open_workspace
 
     space = open_workspace(configuration)
-    train_stage(space, fresh)
+    train_stage(space, fresh, device)
     click.echo(f"twin written to {space.twin}")
 
 
@@ -241,6 +249,7 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
     "--seconds", type=float, default=120.0, show_default=True, help="Wall time to train; ends with the step under way."
 )
 @click.option("--ranks", type=int, default=0, help="MPI ranks; 0: one a core.")
+@_DEVICE
 @click.option(
     "--output", type=_PATH, default=Path("twin-run"), show_default=True, help="Folder of everything that is made."
 )
@@ -293,7 +302,7 @@ def build(
         },
         "training": {"seconds": given["seconds"]},
     }
-    build_twin(parse_config(entries, "command line"), output, click.echo, again)
+    build_twin(parse_config(entries, "command line"), output, click.echo, again, given["device"])
 
 
 def _named(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:

@@ -142,6 +142,9 @@ class TrainingSection(_Section):
     )
     epochs: int = Field(0, ge=0, description="passes over the samples instead, whatever time they take; 0: by seconds")
     seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
+    patience: int = Field(
+        0, ge=0, description="end after so many of the 40 rounds without a smaller validation error; 0: never early"
+    )
     settings: dict[str, int | float | bool | str] = Field(
         default_factory=dict, description="further settings of the architecture by name: { depth = 3 }"
     )

@@ -17,6 +17,7 @@ from softtwin.reference.data.samplers import LoadPlan
 from .config import Config, ConfigError
 from .workspace import Workspace, read_records
 
+_LATER = {"training.patience": 0}  # entries that older records lack: at their default they change nothing
 _MATERIAL = {"law": "material", "young_modulus": "young_modulus", "poisson_ratio": "poisson_ratio"}
 
 
@@ -61,7 +62,8 @@ def generate_inputs(space: Workspace, body: Body) -> dict[str, Any]:
 
 def train_inputs(space: Workspace, data: DataSet) -> dict[str, Any]:
     """Entries of [training], the body's file and the identity of the data set."""
-    training = dict(_flat("training", space.config.training.model_dump()))
+    every = _flat("training", space.config.training.model_dump())
+    training = {name: value for name, value in every if _LATER.get(name, ...) != value}
     return {"body.vtu": _sha256(space.body), "data set": data.identity, **training}
 
 

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger
 from torch import Tensor
 from tqdm import tqdm
 
@@ -34,9 +35,18 @@ class Diverged(RuntimeError):  # noqa: N818 - a way to end, as NotConverged is
     """Training whose validation error is no finite number any more: the message says what to try."""
 
 
-def device() -> str:
-    """Where to train."""
-    return "cuda" if torch.cuda.is_available() else "cpu"
+def chosen_device(plan: TrainingPlan) -> str:
+    """Where to train.
+
+    Raises:
+        ValueError: a GPU is asked for, and torch sees none.
+    """
+    if plan.device == "cuda" and not torch.cuda.is_available():
+        raise ValueError(
+            "TrainingPlan.device: expected a GPU that torch can use, found none (torch "
+            f"{torch.__version__}); take 'cpu' or 'auto', or a build of torch with CUDA."
+        )
+    return "cuda" if plan.device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def _count_steps(plan: TrainingPlan, sample_count: int) -> int | None:
@@ -110,6 +120,8 @@ class Course(lightning.LightningModule):
         self.rounds = ROUNDS if self.steps is None else min(ROUNDS, self.steps)
         self.best: dict[str, Tensor] = {}
         self.best_error = math.inf
+        self.stale = 0  # rounds since then
+        self._loss, self._count = torch.zeros(()), 0  # of the round
         self.seconds = 0.0
         self.steps_made = 0
 
@@ -149,7 +161,9 @@ class Course(lightning.LightningModule):
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
         """Loss of one batch."""
-        return self.lesson.loss(batch)
+        loss: Tensor = self.lesson.loss(batch)
+        self._loss, self._count = self._loss.to(loss.device) + loss.detach(), self._count + 1
+        return loss
 
     def on_train_epoch_end(self) -> None:
         """Look at the validation split and keep the weights if they are the best so far."""
@@ -160,11 +174,23 @@ class Course(lightning.LightningModule):
                 f"train: the validation error is {error} after {self.steps_made} steps at learning rate "
                 f"{self.plan.rate}; lower TrainingPlan.learning_rate."
             )
+        self._log(error)
+        self.stale += 1
         if error < self.best_error:
-            self.best_error = error
+            self.best_error, self.stale = error, 0
             self.best = {name: value.detach().clone() for name, value in self.lesson.network.state_dict().items()}
-        if self.share >= 1.0:
+        if self.share >= 1.0 or self.stale == self.plan.patience:
             self.trainer.should_stop = True
+
+    def _log(self, error: float) -> None:
+        """One line of the round, where training has a folder."""
+        if self.logger is not None:
+            rate = self.trainer.optimizers[0].param_groups[0]["lr"]
+            loss = float(self._loss) / max(self._count, 1)
+            line = {"seconds": self.seconds, "loss": loss, "validation_error": error, "learning_rate": rate}
+            self.logger.log_metrics(line, step=self.steps_made)
+            self.logger.save()
+        self._loss, self._count = torch.zeros(()), 0
 
     def _look(self) -> None:
         self.seconds = self.clock() - self._origin
@@ -179,6 +205,7 @@ class Course(lightning.LightningModule):
             "best": self.best,
             "best_error": self.best_error,
             "seconds": self.seconds,
+            "stale": self.stale,
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -189,6 +216,7 @@ class Course(lightning.LightningModule):
         """Go on from what `on_save_checkpoint` added."""
         for name in ("best", "best_error", "seconds", "steps_made"):
             setattr(self, name, course[name])
+        self.stale = course.get("stale", 0)
 
 
 class _Progress(Callback):
@@ -217,13 +245,14 @@ class _Progress(Callback):
             self._bar.close()
 
 
-def fit(course: Course, path: Path, resume: bool) -> None:
+def fit(course: Course, path: Path, resume: bool, log: bool = False) -> None:
     """Train to the end of the plan; every round leaves a checkpoint.
 
     Args:
         course: what to train.
         path: of the checkpoint.
         resume: go on from it.
+        log: leave a CSV file beside it with a line for each round, in a folder of its own for each run.
     """
     with _quiet(), _interruptible():
         keeper = ModelCheckpoint(
@@ -233,13 +262,13 @@ def fit(course: Course, path: Path, resume: bool) -> None:
             enable_version_counter=False,
         )
         trainer = lightning.Trainer(
-            accelerator="gpu" if device() == "cuda" else "cpu",
+            accelerator="gpu" if chosen_device(course.plan) == "cuda" else "cpu",
             devices=1,
             plugins=LightningEnvironment(),  # else it looks for MPI and starts it
             max_epochs=course.rounds,
             reload_dataloaders_every_n_epochs=1,
             callbacks=[keeper, _Progress()],
-            logger=False,
+            logger=CSVLogger(path.parent, name="logs") if log else False,
             enable_progress_bar=False,
             enable_model_summary=False,
             default_root_dir=path.parent,

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -59,6 +60,7 @@ class PhysicsLesson(nn.Module):
         physics: weights.
     """
 
+    _loaded: Tensor
     _left: Tensor
     _right: Tensor
 
@@ -75,7 +77,7 @@ class PhysicsLesson(nn.Module):
         right = torch.from_numpy(data.response.right).float()
         self.register_buffer("_left", left.reshape(-1, 3, left.shape[1])[loaded].flatten(0, 1), persistent=False)
         self.register_buffer("_right", right, persistent=False)
-        self._loaded = torch.from_numpy(loaded)
+        self.register_buffer("_loaded", torch.from_numpy(np.asarray(loaded, dtype=np.int64)), persistent=False)
 
     @property
     def network(self) -> nn.Module:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from typing import Any, Literal, get_args
 
 from .architecture import Architecture
 from .physics import Physics
 from .reduced import Reduced
+
+Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,8 @@ class TrainingPlan:
         samples: draws of the training split to use; None for all.
         seed: seed of weights and batches.
         physics: what is asked of predictions beside, or instead of, the data; None for the data alone.
+        patience: training ends after so many of its 40 rounds without a smaller validation error; None: never early.
+        device: where to train; `auto` takes a GPU where torch sees one.
 
     Raises:
         ValueError: an argument out of its range.
@@ -39,9 +43,11 @@ class TrainingPlan:
     samples: int | None = None
     seed: int = 0
     physics: Physics | None = None
+    patience: int | None = None
+    device: Device = "auto"
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch", "samples"):
+        for name in ("epochs", "batch", "samples", "patience"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"TrainingPlan.{name}: expected at least 1, got {value}.")
@@ -49,6 +55,8 @@ class TrainingPlan:
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise ValueError(f"TrainingPlan.{name}: expected a positive number, got {value}.")
+        if self.device not in get_args(Device):
+            raise ValueError(f"TrainingPlan.device: expected one of {get_args(Device)}, got {self.device!r}.")
 
     @property
     def rate(self) -> float:
@@ -60,10 +68,10 @@ class TrainingPlan:
         return min(self.batch or self.architecture.batch, count)
 
     def entries(self) -> dict[str, Any]:
-        """All settings by name, those of the architecture among them, for cards and checkpoints."""
+        """All settings that decide what is learned, those of the architecture among them, for cards and checkpoints."""
         kind = self.architecture
         physics = None if self.physics is None else asdict(self.physics)
-        own = {**_settings(self, "architecture"), "physics": physics}
+        own = {**_settings(self, "architecture", "device"), "physics": physics}
         return {"architecture": kind.name, **_settings(kind), **own}
 
 

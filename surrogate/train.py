@@ -17,7 +17,7 @@ from softtwin.reference.data.dataset import DataSet, Samples
 from softtwin.reference.data.schema import Reason
 
 from .checkpoint import CHECKPOINT, fingerprint, read_checkpoint
-from .course import Course, device, fit
+from .course import Course, chosen_device, fit
 from .model import Surrogate
 from .physics import with_physics
 from .plan import TrainingPlan
@@ -35,15 +35,17 @@ def train(
     Args:
         data: the data set.
         plan: what to train.
-        folder: for the checkpoint; None for none that outlasts the call.
+        folder: for the checkpoint and `logs/`; None for none that outlasts the call.
         clock: seconds since whenever; `plan.seconds` is measured with it.
 
     Raises:
         CheckpointError: the folder's checkpoint is truncated, or of another plan or data set.
         DataSetError: the training or validation split is not complete.
         Diverged: the validation error is no finite number any more.
-        ValueError: a split holds no accepted sample, or numbers that are not finite.
+        ValueError: a GPU is asked for and there is none; a split holds no accepted sample, or numbers that are not
+            finite.
     """
+    where = chosen_device(plan)
     splits = {"train": data.samples("train", plan.samples), "validation": data.samples("validation")}
     for name, samples in splits.items():
         _check_split(data, name, samples)
@@ -54,12 +56,12 @@ def train(
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(plan.seed)
             lesson = plan.architecture.lesson(data, splits["train"], splits["validation"])
-        lesson = with_physics(lesson, data, plan.physics).to(device())
+        lesson = with_physics(lesson, data, plan.physics).to(where)
         course = Course(lesson, plan, mark, clock)
         if resumed:
             course.take_back(resumed)
         if course.share < 1.0:
-            fit(course, path, resumed is not None)
+            fit(course, path, resumed is not None, log=folder is not None)
     lesson.network.load_state_dict(course.best)
     return Surrogate(data.body, lesson.maps(), lesson.trained(), _card(data, plan, splits, course))
 
@@ -96,7 +98,7 @@ def _card(data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], course:
             "steps": course.steps_made,
             "seconds": course.seconds,
             "validation_error": course.best_error,
-            "device": device(),
+            "device": chosen_device(plan),
             "versions": {"torch": torch.__version__, "lightning": lightning.__version__},
         },
         "domain": {

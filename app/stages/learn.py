@@ -13,12 +13,13 @@ import numpy as np
 
 from softtwin.meshes.metrics import nodal_distances
 from softtwin.reference.data.dataset import DataSet
+from softtwin.surrogate.course import chosen_device
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.physics import Physics
-from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.plan import Device, TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.registry import ARCHITECTURES
 from softtwin.surrogate.train import train
@@ -29,12 +30,13 @@ from ..inputs import check_trained, current_data, train_inputs, validate_inputs
 from ..workspace import Workspace, locked, timed, write_whole
 
 
-def train_stage(space: Workspace, fresh: bool = False) -> Surrogate:
+def train_stage(space: Workspace, fresh: bool = False, device: Device = "auto") -> Surrogate:
     """Train on the data set and write the twin: body, weights, card, configuration. Goes on from the last checkpoint.
 
     Args:
         space: the workspace.
         fresh: throw earlier checkpoints away instead.
+        device: where to train.
 
     Raises:
         ConfigError: there is no body, or one of another configuration; or another `train` is at work there.
@@ -43,13 +45,13 @@ def train_stage(space: Workspace, fresh: bool = False) -> Surrogate:
     """
     data, _ = current_data(space)
     with locked(space, "train"):
-        return _train(space, data, fresh)
+        return _train(space, data, fresh, device)
 
 
-def _train(space: Workspace, data: DataSet, fresh: bool) -> Surrogate:
+def _train(space: Workspace, data: DataSet, fresh: bool, device: Device) -> Surrogate:
     if fresh:
         shutil.rmtree(space.training, ignore_errors=True)
-    plan = training_plan(space.config.training)
+    plan = training_plan(space.config.training, device)
     with timed(space, "train", train_inputs(space, data)):
         surrogate = with_discrepancy(with_domain(train(data, plan, space.training), data), data)
         save(surrogate, space.twin)
@@ -60,23 +62,32 @@ def _train(space: Workspace, data: DataSet, fresh: bool) -> Surrogate:
     return surrogate
 
 
-def training_plan(section: TrainingSection) -> TrainingPlan:
+def training_plan(section: TrainingSection, device: Device = "auto") -> TrainingPlan:
     """What [training] asks for.
+
+    Args:
+        section: of the configuration.
+        device: where to train; it is of the machine, and not of the configuration.
 
     Raises:
         ConfigError: settings that the architecture does not have, or values that it refuses; weights of physics that
             there are not.
+        ValueError: a GPU is asked for and there is none.
     """
     kind: Any = ARCHITECTURES[section.architecture]
     own = {"modes": section.modes, "width": section.width} if kind is Reduced else {}
     physics = _built("training.physics", Physics, section.physics) if section.physics else None
-    return TrainingPlan(
+    plan = TrainingPlan(
         architecture=_built("training.settings", kind, {**own, **section.settings}),
         seconds=section.seconds,
         epochs=section.epochs or None,
         seed=section.seed,
         physics=physics,
+        patience=section.patience or None,
+        device=device,
     )
+    chosen_device(plan)
+    return plan
 
 
 def _built(entry: str, kind: Any, values: Mapping[str, Any]) -> Any:

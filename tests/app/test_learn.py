@@ -39,6 +39,15 @@ def test_settings_and_physics_reach_the_plan() -> None:
     assert grid.architecture == UMesh(16, numbering="long") and grid.physics == Physics(energy=0.5)
 
 
+def test_a_gpu_that_is_not_there_is_refused_before_anything_is_made(tmp_path: Path, monkeypatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match=r"TrainingPlan\.device: expected a GPU that torch can use, found none"):
+        make_twin(Workspace(Config(), tmp_path), tmp_path / "organ.toml", print, device="cuda")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_they_survive_the_configuration_file(tmp_path: Path) -> None:
     training = {"architecture": "umesh", "settings": {"channels": 8, "numbering": "long"}, "physics": {"residual": 0.5}}
     config = parse_config({"training": training})

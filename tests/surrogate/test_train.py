@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import signal
 from dataclasses import replace
@@ -268,3 +269,28 @@ def test_plans_out_of_range_are_refused(change: dict[str, Any], message: str) ->
 def test_settings_of_a_network_out_of_range_are_refused(settings: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         settings()
+
+
+def test_training_that_gets_no_better_ends_early(
+    data: DataSet, small_plan: TrainingPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten times the rate that is good for it: the error soon stays above its least. Each round leaves a line."""
+    monkeypatch.setattr(training, "ROUNDS", 40)
+    plan = replace(small_plan, epochs=200, learning_rate=0.05)
+    whole = train(data, plan)
+    short = train(data, replace(plan, patience=3), tmp_path)
+    assert short.card["training"]["steps"] < whole.card["training"]["steps"]
+    (log,) = (tmp_path / "logs").glob("*/metrics.csv")
+    with log.open() as file:
+        lines = list(csv.DictReader(file))
+    errors = [float(line["validation_error"]) for line in lines]
+    assert int(lines[-1]["step"]) == short.card["training"]["steps"]
+    assert min(errors) == short.card["training"]["validation_error"]
+    assert len(errors) - 1 - int(np.argmin(errors)) == 3
+    assert all(float(line["loss"]) > 0.0 for line in lines)
+
+
+@pytest.mark.parametrize(("setting", "value"), [("patience", 0), ("device", "tpu")])
+def test_wrong_settings_of_training_are_named(setting: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=rf"TrainingPlan\.{setting}: expected"):
+        TrainingPlan(**{setting: value})
