@@ -1,0 +1,178 @@
+"""What a prediction costs, host to host, on a CPU (one thread) or a GPU: batch 1, Jacobians, and batches of many.
+
+    python benchmarks/prediction.py [--device auto] [--data FOLDER] [--graphs]
+
+Networks of the beam of 304 hexahedra at the sizes of `networks.py`, with fresh weights: their cost does not depend on
+what they have learned. Times are medians. Of a batch the weights are read once, and every sample needs its operations:
+both are given as shares of what a large product reaches on the same machine. Without --data a small data set is made
+(a minute).
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from networks import CHANNELS, data_of
+from record import write
+from threadpoolctl import threadpool_limits
+
+from softtwin.reference.data.dataset import DataSet
+from softtwin.surrogate.architecture import Architecture
+from softtwin.surrogate.export import export
+from softtwin.surrogate.exported import ExportedTwin
+from softtwin.surrogate.fast import FastSurrogate
+from softtwin.surrogate.mlp import Perceptron
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.transolver import Transolver
+from softtwin.surrogate.umesh import UMesh
+
+BATCHES = (1, 16, 256)
+LEAST_SECONDS = 1.0
+
+
+def surrogate_of(architecture: Architecture, data: DataSet) -> Surrogate:
+    """One with fresh weights."""
+    torch.manual_seed(0)
+    samples = data.samples("train")
+    lesson = architecture.lesson(data, samples, data.samples("validation"))
+    return Surrogate(data.body, lesson.maps(), lesson.trained(), {"architecture": architecture.name})
+
+
+def median_ms(task: Callable[[], Any]) -> float:
+    """Milliseconds of one call, after a few that warm up."""
+    for _ in range(3):
+        task()
+    times: list[float] = []
+    while sum(times) < LEAST_SECONDS or len(times) < 5:
+        began = time.perf_counter()
+        task()
+        times.append(time.perf_counter() - began)
+    return 1e3 * float(np.median(times))
+
+
+def peak(device: str) -> dict[str, float]:
+    """What large products reach in single precision: operations and bytes a second."""
+    matrix = torch.ones(2048, 2048, device=device)
+    vector = torch.ones(2048, 1, device=device)
+    wide = torch.ones(16384, 2048, device=device)
+
+    def timed(task: Callable[[], Any]) -> float:
+        def whole() -> None:
+            task()
+            if device == "cuda":
+                torch.cuda.synchronize()
+
+        return 1e-3 * median_ms(whole)
+
+    return {
+        "operations_per_s": 2 * 2048**3 / timed(lambda: matrix @ matrix),
+        "bytes_per_s": 4 * wide.numel() / timed(lambda: wide @ vector),
+    }
+
+
+def counted(surrogate: Surrogate) -> tuple[float, float]:
+    """Floating-point operations of one sample, and bytes of all weights in single precision."""
+    from torch.utils.flop_counter import FlopCounterMode
+
+    from softtwin.surrogate.export import Value
+
+    inputs = 3 * len(surrogate.maps.loaded)
+    module = Value(surrogate, np.eye(inputs))
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        module(torch.zeros(1, inputs))
+    arrays = [*module.parameters(), *(b for b in module.buffers() if b.is_floating_point())]
+    return float(counter.get_total_flops()), float(sum(4 * a.numel() for a in arrays))
+
+
+def measured(
+    architecture: Architecture, data: DataSet, device: str, graphs: bool, limits: dict[str, float]
+) -> dict[str, Any]:
+    """All figures of one network."""
+    surrogate = surrogate_of(architecture, data)
+    samples = data.samples("test")
+    loads = np.zeros((max(BATCHES), *data.body.points.shape))
+    loads[:, data.response.loaded] = np.resize(samples.forces, (max(BATCHES), *samples.forces.shape[1:]))
+    fast = FastSurrogate(surrogate, device)  # type: ignore[arg-type]
+    coefficients = np.full(fast.directions.shape[1], 1e-3)
+    operations, size = counted(surrogate)
+    found: dict[str, Any] = {
+        "device": fast.device,
+        "weights_bytes": size,
+        "operations": operations,
+        "double_ms": median_ms(lambda: surrogate.solve(loads[0])),
+        "single_ms": median_ms(lambda: fast.solve(loads[0])),
+        "with_jacobian_ms": median_ms(lambda: fast.linearised(coefficients)),
+        "batches": {},
+    }
+    for batch in BATCHES:
+        many = FastSurrogate(surrogate, device, batch=batch)  # type: ignore[arg-type]
+        seconds = 1e-3 * median_ms(lambda many=many, batch=batch: many.solve_many(loads[:batch]))
+        found["batches"][batch] = {
+            "samples_per_s": batch / seconds,
+            "share_of_operations": batch * operations / seconds / limits["operations_per_s"],
+            "share_of_bytes": size / seconds / limits["bytes_per_s"],
+        }
+    if graphs:
+        with tempfile.TemporaryDirectory() as temporary:
+            runtime = ExportedTwin(export(surrogate, Path(temporary) / "graphs"))
+        found["onnxruntime_ms"] = median_ms(lambda: runtime.solve(loads[0]))
+        found["onnxruntime_with_jacobian_ms"] = median_ms(lambda: runtime.linearised(coefficients))
+    return found
+
+
+def show(label: str, found: dict[str, Any]) -> None:
+    """One network, as it is finished."""
+    times = [f"{found['double_ms']:.2f} ms in double", f"{found['single_ms']:.3f} in single precision"]
+    times.append(f"{found['with_jacobian_ms']:.2f} with Jacobian")
+    if "onnxruntime_ms" in found:
+        times.append(f"onnxruntime {found['onnxruntime_ms']:.3f} / {found['onnxruntime_with_jacobian_ms']:.2f}")
+    for batch, f in found["batches"].items():
+        shares = f"{100 * f['share_of_operations']:.0f} % of operations, {100 * f['share_of_bytes']:.0f} % of bytes"
+        times.append(f"{batch} at once {f['samples_per_s']:.0f}/s ({shares})")
+    print(f"{label:20} {'; '.join(times)}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--graphs", action="store_true", help="also export to ONNX and time onnxruntime (CPU)")
+    arguments = parser.parse_args()
+    data = (
+        DataSet(arguments.data)
+        if arguments.data
+        else data_of("modal", {"train": 64, "validation": 256, "test": 512}, 1)
+    )
+    device = arguments.device
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    kinds: dict[str, Architecture] = {
+        "reduced": Reduced(),
+        "mlp": Perceptron(),
+        f"umesh, {CHANNELS} channels": UMesh(CHANNELS),
+        "transolver": Transolver(),
+    }
+    if device == "cuda":
+        kinds["umesh, 128 channels"] = UMesh(128)
+    name = torch.cuda.get_device_name() if device == "cuda" else "one CPU thread"
+    torch.set_num_threads(1)
+    figures: dict[str, Any] = {"device": name, "networks": {}}
+    with threadpool_limits(1):
+        limits = figures["peak"] = peak(device)
+        for label, architecture in kinds.items():
+            graphs = arguments.graphs and label != "transolver"  # half a minute, for a baseline
+            found = figures["networks"][label] = measured(architecture, data, device, graphs, limits)
+            show(label, found)
+            write("prediction" if device == "cpu" else f"prediction_{name.replace(' ', '_').lower()}", figures)
+
+
+if __name__ == "__main__":
+    main()

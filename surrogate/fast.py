@@ -1,0 +1,151 @@
+"""A surrogate in single precision on a CPU or a GPU: displacement, and displacement with Jacobian, host to host.
+
+On a GPU both are captured once as CUDA graphs: what a prediction costs there is the start of its hundred small kernels.
+They are captured by hand, since torch.compile loses forward-mode tangents (pytorch issues 187284, 183603).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor, nn
+
+from softtwin.reference.data.loading import checked_array
+
+from .export import Linearised, Value, leading_directions
+from .model import Surrogate
+
+Floats = NDArray[np.float64]
+Device = Literal["auto", "cpu", "cuda"]
+_WARM_UP = 3  # runs before a capture, as CUDA asks for
+
+
+class FastSurrogate:
+    """What a surrogate predicts, good to 1e-6 of its largest displacement.
+
+    Args:
+        surrogate: the surrogate.
+        device: `auto` takes a GPU where torch sees one.
+        directions: of force, for the Jacobian: those that move the body most.
+        batch: loads of one call of `solve_many`.
+
+    Raises:
+        ValueError: a GPU is asked for, and torch sees none.
+    """
+
+    def __init__(
+        self, surrogate: Surrogate, device: Device = "auto", directions: int = 64, batch: int | None = None
+    ) -> None:
+        self.device = _resolved(device)
+        self.body, self.loaded, self.batch = surrogate.body, surrogate.maps.loaded, batch
+        self.directions = leading_directions(surrogate, directions)
+        inputs = 3 * len(self.loaded)
+        value = Value(surrogate, np.eye(inputs))
+        self._value = Captured(value, torch.zeros(1, inputs), self.device)
+        linearised = Linearised(surrogate, self.directions)
+        self._linearised = Captured(linearised, torch.zeros(self.directions.shape[1]), self.device)
+        self._many = None if batch is None else Captured(value, torch.zeros(batch, inputs), self.device)
+
+    def solve(self, forces: ArrayLike) -> Floats:
+        """Displacement, (n, 3), metres, under nodal forces, (n, 3), newtons; those at nodes never loaded are left out.
+
+        Raises:
+            ValueError: another shape, or numbers that are not finite.
+        """
+        given = checked_array("FastSurrogate.forces", forces, self.body.points.shape)
+        (found,) = self._value(given[self.loaded].reshape(1, -1))
+        return found.reshape(-1, 3).astype(np.float64)
+
+    def solve_many(self, forces: ArrayLike) -> Floats:
+        """Displacements, (batch, n, 3), metres, under as many nodal forces, newtons.
+
+        Raises:
+            ValueError: another shape than the batch's, or numbers that are not finite.
+        """
+        if self._many is None:
+            raise ValueError("FastSurrogate.batch: expected a number of loads when it was built, got None.")
+        given = checked_array("FastSurrogate.forces", forces, (self.batch or 0, *self.body.points.shape))
+        (found,) = self._many(given[:, self.loaded].reshape(len(given), -1))
+        return found.reshape(len(given), -1, 3).astype(np.float64)
+
+    def linearised(self, coefficients: ArrayLike) -> tuple[Floats, Floats]:
+        """Displacement, (n, 3), metres, and its derivative, (3n, k), for coefficients of the directions, (k,), newtons.
+
+        Raises:
+            ValueError: another shape, or numbers that are not finite.
+        """
+        given = checked_array("FastSurrogate.coefficients", coefficients, (self.directions.shape[1],))
+        displacement, jacobian = self._linearised(given)
+        return displacement.reshape(-1, 3).astype(np.float64), jacobian.astype(np.float64)
+
+
+class Captured:
+    """A module without gradients, from arrays to arrays; on a GPU replayed from a CUDA graph.
+
+    Args:
+        module: in single precision.
+        example: an input of the shape that all will have.
+        device: `cpu` or `cuda`.
+    """
+
+    def __init__(self, module: nn.Module, example: Tensor, device: str) -> None:
+        self._module, self._device = module.to(device).eval().requires_grad_(False), device
+        self._graph: torch.cuda.CUDAGraph | None = None
+        if device == "cuda":
+            self._capture(example)
+
+    def _capture(self, example: Tensor) -> None:
+        self._input = example.to("cuda")
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.no_grad(), _exact(), torch.cuda.stream(stream):
+            for _ in range(_WARM_UP):
+                self._run(self._input)
+        torch.cuda.current_stream().wait_stream(stream)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.no_grad(), _exact(), torch.cuda.graph(self._graph):
+            self._outputs = self._run(self._input)
+        self._sent = torch.empty(example.shape, pin_memory=True)
+        self._received = [torch.empty(output.shape, pin_memory=True) for output in self._outputs]
+
+    def _run(self, given: Tensor) -> tuple[Tensor, ...]:
+        found = self._module(given)
+        return found if isinstance(found, tuple) else (found,)
+
+    def __call__(self, given: Floats) -> list[NDArray[np.float32]]:
+        """Outputs for an input, copied: the next call does not change them."""
+        if self._graph is None:
+            with torch.no_grad():
+                return [output.numpy() for output in self._run(torch.from_numpy(given.astype(np.float32)))]
+        self._sent.copy_(torch.from_numpy(given))
+        self._input.copy_(self._sent, non_blocking=True)
+        self._graph.replay()
+        for host, output in zip(self._received, self._outputs, strict=True):
+            host.copy_(output, non_blocking=True)
+        torch.cuda.synchronize()
+        return [host.numpy().copy() for host in self._received]
+
+
+@contextmanager
+def _exact() -> Iterator[None]:
+    """Without TF32, whose ten bits are too few."""
+    kept = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+    try:
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+        yield
+    finally:
+        torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = kept
+
+
+def _resolved(device: Device) -> str:
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError(
+            f"FastSurrogate.device: expected a GPU that torch can use, found none (torch {torch.__version__}); take "
+            "'cpu' or 'auto', or a build of torch with CUDA."
+        )
+    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
