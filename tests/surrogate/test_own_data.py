@@ -22,7 +22,7 @@ from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.residual import ElasticBody
 from softtwin.surrogate.train import train
 
-COUNT = 60
+COUNT = 160
 PLAN = TrainingPlan(Reduced(modes=6, width=32, depth=2), epochs=150)
 
 
@@ -47,7 +47,7 @@ def test_every_sample_is_in_one_split_as_it_came(tmp_path: Path, small_beam: Bod
     forces, displacements = arrays
     data = made(tmp_path, small_beam, (1e3 * forces, 1e2 * displacements), length_unit="cm", force_unit="mN")
     found = [data.samples(split) for split in ("train", "validation", "test")]
-    assert [len(samples) for samples in found] == [48, 6, 6] and len(data.rejected().draws) == 0
+    assert [len(samples) for samples in found] == [128, 16, 16] and len(data.rejected().draws) == 0
     assert data.missing_blocks() == [] and data.damaged_blocks() == {}
     stored = np.concatenate([samples.displacements for samples in found])
     order = np.argsort(stored.sum(axis=(1, 2)))
@@ -84,7 +84,7 @@ def test_with_a_material_the_linear_response_is_that_at_rest(tmp_path: Path, sma
     moved = torch.from_numpy(data.response.apply(load.numpy()[:, data.response.loaded]))
     assert float(body.residual(moved, load)) < 1e-4
     assert data.material.parameters == law.parameters
-    assert balance(train(data, PLAN), data).samples == 6
+    assert balance(train(data, PLAN), data).samples == 16
 
 
 def test_the_fitted_map_is_exact_where_the_simulator_is_linear(tmp_path: Path, small_beam: Body, arrays: Any) -> None:
@@ -109,7 +109,7 @@ WRONG: dict[str, tuple[Any, dict[str, Any], str]] = {
     "shape": (lambda b, u: (b[:, 1:], u), {}, r"\.forces: expected shape \(s, 45, 3\)"),
     "empty": (lambda b, u: (b[:0], u[:0]), {}, r"\.forces: expected shape .*s >= 1"),
     "nan": (lambda b, u: (b, _changed(u, (2, 5, 0), np.nan)), {}, r"\.displacements: expected finite.* got 1 samples"),
-    "counts": (lambda b, u: (b[1:], u), {}, r"as many forces as displacements, got 59 and 60"),
+    "counts": (lambda b, u: (b[1:], u), {}, r"as many forces as displacements, got 159 and 160"),
     "unit": (lambda b, u: (b, 1e3 * u), {}, r"\.length_unit: .* are they in another unit\?"),
     "no unit": (lambda b, u: (b, u), {"length_unit": "inch"}, r"\.length_unit: expected one of m, cm, mm, got 'inch'"),
     "no force unit": (lambda b, u: (b, u), {"force_unit": "lbf"}, r"\.force_unit: expected one of N, mN, kN"),
