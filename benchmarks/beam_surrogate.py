@@ -17,8 +17,7 @@ from record import write
 from softtwin.app.chain import prepare
 from softtwin.app.config import Config
 from softtwin.app.launch import generate_in_parallel
-from softtwin.meshes.files import write_body
-from softtwin.meshes.shapes import beam
+from softtwin.app.stages.mesh import mesh_stage
 from softtwin.reference.data.dataset import DataSet, Samples
 from softtwin.reference.generate import plan_from_header
 from softtwin.reference.solve.problem import Problem
@@ -37,7 +36,7 @@ def make_data(folder: Path, ranks: int) -> DataSet:
     loads = {"amplitude": 0.03, "patches": 1, "radius": (0.055, 0.64)}
     config = Config.model_validate({"folder": ".", "body": {"source": "beam"}, "loads": loads, "samples": samples})
     space = prepare(config, folder)
-    write_body(space.body, beam())
+    mesh_stage(space)
     generate_in_parallel(folder / "organ.toml", ranks)
     return DataSet(space.data)
 

@@ -25,9 +25,8 @@ from record import RESULTS, write
 from softtwin.app.chain import prepare
 from softtwin.app.config import Config
 from softtwin.app.launch import generate_in_parallel
-from softtwin.meshes.files import write_body
-from softtwin.meshes.shapes import beam
-from softtwin.reference.data.dataset import DataSet, Samples
+from softtwin.app.stages.mesh import mesh_stage
+from softtwin.reference.data.dataset import DataSet, Samples, existing
 from softtwin.reference.generate import plan_from_header
 from softtwin.reference.solve.problem import Problem
 from softtwin.surrogate.architecture import Architecture, Network
@@ -58,9 +57,12 @@ def data_of(kind: str, counts: dict[str, int], ranks: int) -> DataSet:
     folder = RUNS / f"beam-{kind}-{counts['train']}"
     loads = {"kind": kind, "amplitude": AMPLITUDES[kind], "patches": 1, "radius": (0.055, 0.64)}
     samples = {**counts, "block": 16, "ranks": ranks}
+    made = existing(folder / "data.zarr")
+    if made is not None and not made.missing_blocks():
+        return made
     config = Config.model_validate({"folder": ".", "body": {"source": "beam"}, "loads": loads, "samples": samples})
     space = prepare(config, folder)
-    write_body(space.body, beam())
+    mesh_stage(space)
     generate_in_parallel(folder / "organ.toml", ranks)
     return DataSet(space.data)
 
