@@ -93,7 +93,7 @@ class PhysicsLesson(nn.Module):
         return count
 
     def loss(self, batch: Tensor) -> Tensor:
-        """The weighted sum over the samples with the given numbers; beside data, physics of the first eighth of them."""
+        """The weighted sum over the samples with the given numbers; beside data, physics of their first eighth."""
         wanted = self.physics
         total = wanted.data * self.lesson.loss(batch) if wanted.data else torch.zeros((), device=batch.device)
         if not wanted.energy + wanted.residual:
