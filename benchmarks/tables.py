@@ -93,11 +93,39 @@ def sequences(name: str) -> None:
     print(f"\nmean TRE of all: {sum(f['mean_tre_mm'] for f in each) / len(each):.3f} mm")
 
 
+def networks(name: str) -> None:
+    """Networks on the beam: held-out errors of both distributions, and how sound the predictions are."""
+    found = figures(name)
+    if not found:
+        return
+    head(name, "e mm (largest)", "relative % (95 %)", "cosine", "Jacobian %", "residual", "inside out; indefinite",
+         "f(0) mm", "other loads: e mm", "steps; s")  # fmt: skip
+    for key, f in found.items():
+        own = f[f["learned_from"]]
+        sound, training = own["balance"], f["training"] or {}
+        other = [f[kind]["nodal_error"]["mean"] for kind in ("modal", "random") if kind in f and f[kind] is not own]
+        residual = sound["residual"]
+        row(
+            key,
+            f"{1e3 * own['nodal_error']['mean']:.3f} ({1e3 * own['largest_error']['mean']:.2f})",
+            f"{100 * own['relative_error']['median']:.3f} ({100 * own['relative_error']['p95']:.2f})",
+            f"{own['gradient_cosine']['mean']:.5f}",
+            f"{100 * own['jacobian_error']['mean']:.1f}",
+            "-" if residual is None else f"{residual['median']:.2g}",
+            f"{sound['inside_out']}; {sound['indefinite']} of {sound['samples']}",
+            f"{1e3 * sound['at_rest']:.3f}",
+            f"{1e3 * other[0]:.3f}" if other else "-",
+            f"{training.get('steps', '-')}; {f['wall_s']:.0f}",
+        )
+
+
 def main() -> None:
     for model in ("surrogate", "reference"):
         robustness(model)
     sequences("registration_reference_default_facets")
     sequences("registration_surrogate")
+    networks("networks")
+    networks("networks_physics")
 
 
 if __name__ == "__main__":
