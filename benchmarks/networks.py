@@ -217,6 +217,7 @@ def main() -> None:
     parser.add_argument("--train", type=int, default=8192)
     parser.add_argument("--seconds", type=float, default=200.0)
     parser.add_argument("--own-alone", action="store_true", help="leave the other distribution out")
+    parser.add_argument("--only", default="", help="rows that have this in their name")
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
     held_out = {"validation": 256, "test": 512}
@@ -229,6 +230,8 @@ def main() -> None:
     plan = plan_from_header(data["modal"].header)
     with Problem(data["modal"].body, plan.build_material(), plan.newton) as problem:
         for row in rows(arguments.tables, arguments.train, arguments.seconds):
+            if arguments.only not in row.key:
+                continue
             if row.key not in found:
                 found[row.key] = run(row, data, problem)
                 write(path.stem, found)

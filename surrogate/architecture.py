@@ -14,6 +14,9 @@ from softtwin.reference.data.dataset import DataSet, Samples
 from .maps import LinearMaps
 
 
+_AT_ONCE = 64  # tangents: a thousand through the grids of a U-Net would take 20 GB
+
+
 class Linearisation(Protocol):
     """A network at one point: its values and their derivative there."""
 
@@ -61,7 +64,7 @@ class Differentiated:
         def one(tangent: Tensor) -> Tensor:
             return torch.func.jvp(self._value, (self.coordinates,), (tangent,))[1]
 
-        return torch.func.vmap(one, in_dims=1, out_dims=1)(tangents)
+        return torch.func.vmap(one, in_dims=1, out_dims=1, chunk_size=_AT_ONCE)(tangents)
 
     def pull(self, cotangent: Tensor) -> Tensor:
         """Gradient with respect to the coordinates, (d,), for one with respect to the values, (e,)."""

@@ -68,6 +68,14 @@ def test_values_and_derivatives_are_those_of_torch_func(network: Network, point:
         assert (found - known).abs().max() < 1e-12 * known.abs().max()
 
 
+def test_more_tangents_than_are_taken_at_once_are_pushed_one_by_one(network: Network, point: torch.Tensor) -> None:
+    tangents = _drawn(len(point), 70) * point.abs().max()
+    at = network.linearised(point)
+    pushed = at.push(tangents)
+    apart = torch.cat([at.push(tangents[:, i : i + 1]) for i in (0, 63, 64, 69)], dim=1)
+    assert (pushed[:, [0, 63, 64, 69]] - apart).abs().max() < 1e-12 * pushed.abs().max()
+
+
 def test_derivatives_are_those_of_differences(network: Network, point: torch.Tensor) -> None:
     tangent = _drawn(len(point), 1) * point.abs().max()
     step = 1e-6
