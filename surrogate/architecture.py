@@ -13,7 +13,6 @@ from softtwin.reference.data.dataset import DataSet, Samples
 
 from .maps import LinearMaps
 
-
 _AT_ONCE = 64  # tangents: a thousand through the grids of a U-Net would take 20 GB
 
 
