@@ -105,6 +105,8 @@ def rows(tables: list[str], train_count: int, seconds: float) -> Iterator[Row]:
         for name, (architecture, seeds) in kinds.items():
             for seed in range(seeds):
                 yield Row("4.2", f"{name}, seed {seed}", TrainingPlan(architecture, seconds=seconds, seed=seed))
+        slow = TrainingPlan(Reduced(), seconds=seconds, learning_rate=1e-3)
+        yield Row("4.2", "reduced, a third of the learning rate", slow)
         yield Row("4.2", "reduced, six times as long", TrainingPlan(Reduced(), seconds=6.0 * seconds))
     if "4.5" in tables:
         for numbering in ("short", "long"):
