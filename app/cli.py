@@ -235,6 +235,9 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 @click.option("--inner", multiple=True, metavar="NAME=FILE", help="A vessel or tumour surface to carry along.")
 @click.option("--nodes", type=int, default=2000, show_default=True, help="Nodes wanted where a surface is made solid.")
 @click.option("--cell-size", type=float, default=0.0, help="Edge length instead, metres.")
+@click.option(
+    "--grid", type=float, default=0.0, help="A regular grid of hexahedra of this edge length instead of tetrahedra, m."
+)
 @click.option("--law", type=click.Choice(LAWS), default="neo-hookean", show_default=True)
 @click.option("--young-modulus", type=float, default=5000.0, show_default=True, help="Pascals.")
 @click.option("--poisson-ratio", type=float, default=0.45, show_default=True)
@@ -286,7 +289,7 @@ def build(
         "zones": _named("--zone", zones),
         "inner": _named("--inner", inner),
         "frame": given["frame"] or "",
-        **{name: given[name] for name in ("unit", "nodes", "cell_size", "fixed_distance")},
+        **{name: given[name] for name in ("unit", "nodes", "cell_size", "grid", "fixed_distance")},
     }
     entries = {
         "folder": ".",

@@ -49,6 +49,12 @@ class BodySection(_Section):
     )
     cell_size: float = Field(0.0, ge=0.0, description="edge length of the tetrahedra in metres; 0: from nodes")
     nodes: Count = Field(2000, description="number of nodes wanted where a surface is made solid and cell_size is 0")
+    grid: float = Field(
+        0.0,
+        ge=0.0,
+        description="edge length, metres, of the hexahedra of a regular grid that carries the organ's surface, in "
+        "place of tetrahedra (architecture umesh wants it); 0: none",
+    )
     fixed: str = Field(
         "",
         description=f"what holds the organ: points or triangles near it, .npy/.txt of node numbers, or {_WHERE}",

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body, Surface
+from softtwin.meshes.embedding import outer
 from softtwin.meshes.export import SURFACE_FORMATS, write_points, write_series, write_surface
 from softtwin.meshes.files import write_deformed
 from softtwin.registration.registrar import Registration
@@ -50,7 +51,7 @@ class Exporter:
     @cached_property
     def _body(self) -> Body:
         body = self.twin.body
-        return replace(body, points=self.twin.coordinates.lengths(body.points), inner={})
+        return replace(body, points=self.twin.coordinates.lengths(body.points), surfaces={}, inner={}, skin=None)
 
     @cached_property
     def _names(self) -> Mapping[str, str]:
@@ -72,9 +73,9 @@ class Exporter:
             write_deformed(self.folder / names[-1], self._body, moved, fields)
         kinds = [kind for kind in SURFACE_FORMATS if kind in self.formats]
         for name, surface in self.twin.surfaces(result).items() if kinds else ():
-            rest = self.twin.body.inner[name].points if name in self.twin.body.inner else self.twin.body.points
+            rest = self.twin.body.inner[name] if name in self.twin.body.inner else outer(self.twin.body).rest
             outward = Surface(place.lengths(surface.points), surface.triangles)
-            shift = {"displacement": place.lengths(surface.points - rest)}
+            shift = {"displacement": place.lengths(surface.points - rest.points)}
             for kind in kinds:
                 names.append(f"{self._names.get(name, 'organ')}_{number:04d}.{kind}")
                 write_surface(self.folder / names[-1], outward, shift)

@@ -17,7 +17,10 @@ from softtwin.reference.data.samplers import LoadPlan
 from .config import Config, ConfigError
 from .workspace import Workspace, read_records
 
-_LATER = {"training.patience": 0}  # entries that older records lack: at their default they change nothing
+_LATER = {
+    "training.patience": 0,
+    "body.grid": 0.0,
+}  # entries that older records lack: at their default they change nothing
 _MATERIAL = {"law": "material", "young_modulus": "young_modulus", "poisson_ratio": "poisson_ratio"}
 
 
@@ -52,7 +55,8 @@ def plan_entries(config: Config) -> dict[str, Any]:
 
 def mesh_inputs(space: Workspace) -> dict[str, Any]:
     """Entries of [body]; one that names a file stands as the hash of its content."""
-    return {name: _content(value, space.root) for name, value in _flat("body", space.config.body.model_dump())}
+    every = _flat("body", space.config.body.model_dump())
+    return {name: _content(value, space.root) for name, value in every if _LATER.get(name, ...) != value}
 
 
 def generate_inputs(space: Workspace, body: Body) -> dict[str, Any]:

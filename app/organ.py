@@ -34,6 +34,7 @@ from softtwin.meshes.files import (
     read_surface,
     stated_frame,
 )
+from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam, liver_phantom, propeller
 from softtwin.meshes.solidify import solidify
 
@@ -115,6 +116,11 @@ def make_organ(section: BodySection, root: Path) -> Organ:
     if regions["observed"]:
         observed, said = _observed(body, regions["observed"], reader)
         body, notes = replace(body, surfaces={**body.surfaces, "observed": observed}), [*notes, *said]
+    if section.grid > 0.0:
+        whole = body.volume
+        body = gridded(body, section.grid)
+        notes.append(f"grid: {len(body.cells)} hexahedra of {1e3 * section.grid:g} mm, {body.volume / whole:.4f} of "
+                     "the volume")  # fmt: skip
     return Organ(body, tuple(notes))
 
 

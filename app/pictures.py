@@ -20,6 +20,7 @@ from PIL import Image
 from vtkmodules.vtkCommonCore import vtkLogger
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.embedding import outer
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -139,8 +140,9 @@ def view_of(towards: Floats, points: Iterable[Floats], margin: float = 1.06) -> 
 
 def camera_side(body: Body) -> Floats:
     """Direction from the body to a camera that sees its observed side, or its broadest side, a little from above."""
-    triangles = body.surfaces.get("observed", body.boundary)
-    a, b, c = (body.points[triangles[:, i]] for i in range(3))
+    surface = outer(body).rest
+    triangles = body.surfaces.get("observed", surface.triangles)
+    a, b, c = (surface.points[triangles[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     forward = normals.sum(axis=0)
     if np.linalg.norm(forward) < 0.2 * np.linalg.norm(normals, axis=1).sum():

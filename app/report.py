@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.embedding import Embedding, carried, target_points
+from softtwin.meshes.embedding import Embedding, carried, outer, target_points
 from softtwin.meshes.files import read_body
 from softtwin.meshes.metrics import mesh_quality, nodal_errors
 from softtwin.reference.data.dataset import SPLITS, DataSet
@@ -187,9 +187,10 @@ def organ_section(space: Workspace, studio: Studio) -> Section:
 def organ_layers(body: Body) -> list[Layer]:
     """The translucent surface, the mesh of the observed side, the inner surfaces and the fixed nodes."""
     colours = inner_colours(body.inner)
-    layers = [Layer(body.points, body.boundary, ORGAN, 0.4)]
+    outside = outer(body).rest
+    layers = [Layer(outside.points, outside.triangles, ORGAN, 0.4)]
     if "observed" in body.surfaces:
-        layers.append(Layer(body.points, body.surfaces["observed"], OBSERVED, 0.35, style="wireframe"))
+        layers.append(Layer(outside.points, body.surfaces["observed"], OBSERVED, 0.35, style="wireframe"))
     layers += [Layer(surface.points, surface.triangles, colours[name]) for name, surface in body.inner.items()]
     return [*layers, Layer(body.points[body.fixed], colour=FIXED, ball=0.011)]
 
@@ -208,14 +209,11 @@ def modes_section(space: Workspace, studio: Studio) -> Section:
     data = _data(space)
     body, shapes = data.body, data.shapes[:_MODES]
     size = _MODE_SIZE * body.size
-    moved = [body.points + size * shape / np.linalg.norm(shape, axis=1).max() for shape in shapes]
-    view = view_of(camera_side(body), [body.points, *moved])
+    fields = [size * shape / np.linalg.norm(shape, axis=1).max() for shape in shapes]
+    view = view_of(camera_side(body), [body.points, *(body.points + field for field in fields)])
     pictures = []
-    for i, points in enumerate(moved):
-        layers = [
-            Layer(points, body.boundary, values=np.linalg.norm(points - body.points, axis=1), limit=size),
-            Layer(body.points, body.boundary, "#8a929c", style="outline"),
-        ]
+    for i, field in enumerate(fields):
+        layers = _coloured(body, field, size, None)
         words = f"mode {i + 1}: {figure(float(data.eigenvalues[i]))} N/m"
         pictures.append(studio.picture(view, layers, words, 480))
     return {"pictures": pictures, "count": len(data.shapes), "size": size}
@@ -324,10 +322,14 @@ def _prediction(studio: Studio, body: Body, name: str, true: Floats, predicted: 
 
 def _coloured(body: Body, field: Floats, limit: float, errors: Floats | None) -> list[Layer]:
     """The deformed body coloured by its displacement, or by the errors if given, and its outline at rest."""
-    rest = Layer(body.points, body.boundary, "#8a929c", style="outline")
+    outside = outer(body)
+    at_rest, moved = outside.rest, outside.moved(field)
+    rest = Layer(at_rest.points, at_rest.triangles, "#8a929c", style="outline")
     if errors is None:
-        return [Layer(body.points + field, body.boundary, values=np.linalg.norm(field, axis=1), limit=limit), rest]
-    return [Layer(body.points + field, body.boundary, values=errors, limit=float(errors.max()), colours=_ERROR), rest]
+        sizes = np.linalg.norm(moved.points - at_rest.points, axis=1)
+        return [Layer(moved.points, moved.triangles, values=sizes, limit=limit), rest]
+    values = outside.carried(errors)
+    return [Layer(moved.points, moved.triangles, values=values, limit=float(errors.max()), colours=_ERROR), rest]
 
 
 def _draw_errors(sheet: Figure, sizes: Floats, errors: Floats) -> None:
@@ -440,15 +442,15 @@ def _wide_pictures(
     studio: Studio, body: Body, states: Sequence[_State], truth: Floats, cloud: Floats, shown: Sequence[str]
 ) -> list[Picture]:
     view = view_of(camera_side(body), [body.points, body.points + truth, cloud])
-    true = carried(body, truth)
-    pictures = []
+    true, outside = carried(body, truth), outer(body)
+    true_outside, pictures = outside.moved(truth), []
     for state in states:
-        moved = carried(body, state.displacement)
+        moved, organ = carried(body, state.displacement), outside.moved(state.displacement)
         layers = [
-            Layer(body.points + state.displacement, body.boundary, ORGAN, 0.35),
+            Layer(organ.points, organ.triangles, ORGAN, 0.35),
             *(Layer(moved[name].points, moved[name].triangles, FOUND) for name in shown),
             *(Layer(true[name].points, true[name].triangles, TRUTH, style="wireframe") for name in shown),
-            Layer(body.points + truth, body.boundary, TRUTH, style="outline"),
+            Layer(true_outside.points, true_outside.triangles, TRUTH, style="outline"),
             Layer(cloud, colour=CLOUD, ball=0.009),
         ]
         pictures.append(studio.picture(view, layers, _state_words(state), 600))

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.embedding import carried
+from softtwin.meshes.embedding import carried, outer
 from softtwin.meshes.export import Coordinates
 
 from .pictures import CLOUD, ORGAN, Layer, Picture, Studio, camera_side, chart, inner_colours, view_of
@@ -149,9 +149,10 @@ def _cloud(folder: Path, row: Mapping[str, Any], place: Coordinates) -> Floats |
 
 def _layers(body: Body, state: Floats, cloud: Floats | None) -> list[Layer]:
     colours = inner_colours(body.inner)
+    rest, moved = outer(body).rest, outer(body).moved(state)
     layers = [
-        Layer(body.points + state, body.boundary, ORGAN, 0.35),
-        Layer(body.points, body.boundary, "#8a929c", style="outline"),
+        Layer(moved.points, moved.triangles, ORGAN, 0.35),
+        Layer(rest.points, rest.triangles, "#8a929c", style="outline"),
     ]
     layers += [
         Layer(surface.points, surface.triangles, colours[name]) for name, surface in carried(body, state).items()

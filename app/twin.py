@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.clouds import CloudError
-from softtwin.meshes.embedding import Embedding, target_points
+from softtwin.meshes.embedding import Embedding, outer, target_points
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import read_body
 from softtwin.reference.data.outcome import NotConverged
@@ -206,9 +206,8 @@ class Twin:
 
     def surfaces(self, result: Registration) -> dict[str, Surface]:
         """The moved surface of each structure, metres, by name: the organ's first, then the inner ones."""
-        outer = "organ" if "organ" not in self.body.inner else "organ surface"
-        moved = Surface(self.body.points + result.displacement, self.body.boundary)
-        return {outer: moved, **self._inner(result)}
+        name = "organ" if "organ" not in self.body.inner else "organ surface"
+        return {name: outer(self.body).moved(result.displacement), **self._inner(result)}
 
     def _inner(self, result: Registration) -> dict[str, Surface]:
         return {
@@ -230,7 +229,7 @@ class Twin:
         Raises:
             CloudError: no pose explains the cloud, or more than one does.
         """
-        found = align(Surface(self.body.points, self._seen), cloud)
+        found = align(Surface(outer(self.body).rest.points, self._seen), cloud)
         if not found.is_found:
             raise CloudError(f"cloud: the pose was not found ({found.outcome.value}). {found.outcome.advice}")
         return self.near(found.pose)
@@ -238,14 +237,14 @@ class Twin:
     @property
     def _seen(self) -> Ints:
         """The side that a camera sees, (t, 3)."""
-        return self.body.surfaces.get("observed", self.body.boundary)
+        return self.body.surfaces.get("observed", outer(self.body).rest.triangles)
 
     def near(self, pose: Pose) -> PosePrior:
         """An unknown pose about an expected one, with the deviations of the configuration."""
         options = self.config.registration
         return PosePrior(
             pose,
-            self.body.points[np.unique(self._seen)].mean(axis=0),
+            outer(self.body).rest.points[np.unique(self._seen)].mean(axis=0),
             np.deg2rad(options.pose_turn),
             options.pose_shift,
         )

@@ -87,10 +87,12 @@ class Body:
         node_sets: named node numbers; `fixed` holds the nodes with zero displacement. A body without that name is
             held by what its problem says.
         surfaces: named sets of boundary triangles as node numbers, (t, 3), for instance `observed`; of boundary edges,
-            (t, 2), in the plane.
+            (t, 2), in the plane; of the skin's triangles as its vertex numbers, where there is a skin.
         inner: named inner surfaces (vessels, tumours) that the volume carries along.
         fractions: filled share of each cell of a sparse grid, (m,), in (0, 1]: what is integrated over a cell counts
             so much; None where all cells are full.
+        skin: the organ's own surface at rest where the cells do not end on it: they carry it (a sparse grid); what is
+            seen and touched is there (see `embedding.outer`). None where the boundary of the cells is that surface.
 
     Raises:
         BodyError: shapes, index ranges, fractions out of range, inverted cells, stray nodes, several components,
@@ -103,6 +105,7 @@ class Body:
     surfaces: Mapping[str, Ints] = field(default_factory=dict)
     inner: Mapping[str, Surface] = field(default_factory=dict)
     fractions: Floats | None = None
+    skin: Surface | None = None
 
     def __post_init__(self) -> None:
         points = _checked_points("Body.points", self.points, (2, 3))
@@ -113,7 +116,8 @@ class Body:
         kind = KINDS[points.shape[1], cells.shape[1]]
         _check_cells(points, cells, kind)
         sets = {name: _checked_set(name, nodes, len(points)) for name, nodes in self.node_sets.items()}
-        surfaces = {name: _checked_facets(name, f, points) for name, f in self.surfaces.items()}
+        vertices = points if self.skin is None else self.skin.points
+        surfaces = {name: _checked_facets(name, f, vertices) for name, f in self.surfaces.items()}
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "cells", _frozen(cells))
         object.__setattr__(self, "node_sets", MappingProxyType(sets))
@@ -288,11 +292,11 @@ class Body:
         sets = {
             name: np.unique(np.concatenate([s, *(_whole(*g, s) for g in groups)])) for name, s in self.node_sets.items()
         }
-        surfaces = {}
-        for name in self.surfaces:
+        surfaces = {} if self.skin is None else dict(self.surfaces)
+        for name in () if self.skin is not None else self.surfaces:
             chosen = np.isin(_rows(outer[:, :width]), _rows(self.facets_of(name)))
             surfaces[name] = split_facets(outer[chosen], kind.pieces)
-        return Body(points, cells, sets, surfaces, self.inner, self.fractions)
+        return Body(points, cells, sets, surfaces, self.inner, self.fractions, self.skin)
 
 
 def _checked_points(name: str, points: ArrayLike, dimensions: tuple[int, ...] = (3,)) -> Floats:

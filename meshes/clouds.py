@@ -8,6 +8,7 @@ from vtkmodules.vtkCommonCore import vtkPoints
 
 from .body import Body, Floats, Surface
 from .closest import cell_locator
+from .embedding import outer
 
 _LIMIT_OF_SIZE = 0.5  # a cloud farther from the body than this part of its size needs a rigid start
 _GLANCE = 200  # points that a cloud's distance is judged by
@@ -71,14 +72,14 @@ def partial_view(
         raise ValueError(f"noise: expected a standard deviation of at least 0 m, got {noise}.")
     if surface is not None and surface not in body.surfaces:
         raise ValueError(f"surface: expected one of {sorted(body.surfaces)}, got {surface!r}.")
-    deformed = Surface(body.points + moved, body.boundary)
+    deformed = outer(body).moved(moved)
     seen = visible_triangles(deformed, direction)
     if surface is not None:
         wanted = {tuple(sorted(corners)) for corners in body.surfaces[surface].tolist()}
-        seen &= np.array([tuple(sorted(corners)) in wanted for corners in body.boundary.tolist()])
+        seen &= np.array([tuple(sorted(corners)) in wanted for corners in deformed.triangles.tolist()])
     if not seen.any():
         raise ValueError("direction: no triangle of the surface is visible from there.")
-    cloud = sample(Surface(deformed.points, body.boundary[seen]), count, rng)
+    cloud = sample(Surface(deformed.points, deformed.triangles[seen]), count, rng)
     return cloud + noise * rng.standard_normal(cloud.shape)
 
 

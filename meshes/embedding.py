@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import chain
 
 import numpy as np
@@ -18,6 +18,7 @@ from .quadrature import shape_functions
 
 _NEWTON_STEPS = 20
 _STEP_TOLERANCE = 1e-13
+_NO_WEIGHT = 1e-9  # a node with less does not move a vertex
 _TOLERANCE = 1e-9  # in local coordinates: how far outside a cell a point still counts as inside
 
 
@@ -87,6 +88,79 @@ def embed(body: Body, points: ArrayLike) -> Embedding:
         raise ValueError("body: expected straight cells, got curved ones; points are found in linear cells alone.")
     weights = shape_functions(body.kind, _local_coordinates(body, cells, positions))[0]
     return Embedding(cells, body.cells[cells], weights, outside, len(body.points))
+
+
+@dataclass(frozen=True, eq=False)
+class Outer:
+    """The organ's own surface, and how the nodes move it.
+
+    Args:
+        rest: at rest: the boundary of the cells with the body's node numbers, or the skin that they carry.
+        weights: of the nodes for each vertex of a skin, (v, n); None where the vertices are the nodes themselves.
+    """
+
+    rest: Surface
+    weights: csr_array | None
+
+    def carried(self, field: ArrayLike) -> Floats:
+        """A nodal field, (n, k), at the vertices, (v, k)."""
+        values = np.asarray(field, dtype=np.float64)
+        return values if self.weights is None else self.weights @ values
+
+    def spread(self, forces: Floats) -> Floats:
+        """Nodal forces, (n, k), that do the same work as forces on the vertices, (v, k)."""
+        return forces if self.weights is None else self.weights.T @ forces
+
+    def moved(self, displacement: ArrayLike) -> Surface:
+        """The surface after the nodes have moved.
+
+        Args:
+            displacement: of the nodes, (n, 3), metres.
+        """
+        return Surface(self.rest.points + self.carried(displacement), self.rest.triangles)
+
+    @cached_property
+    def vertices(self) -> Ints:
+        """Numbers of the vertices in use, sorted."""
+        return np.unique(self.rest.triangles)
+
+    def vertices_of(self, nodes: ArrayLike) -> Ints:
+        """Numbers of the vertices that the given nodes alone move, sorted."""
+        if self.weights is None:
+            return np.intersect1d(nodes, self.vertices)
+        others = np.ones(self.weights.shape[1])
+        others[np.asarray(nodes)] = 0.0
+        return np.flatnonzero(self.weights @ others <= _NO_WEIGHT)
+
+    def nodes_of(self, vertices: ArrayLike) -> Ints:
+        """Numbers of the nodes that move the given vertices, sorted."""
+        chosen = np.asarray(vertices, dtype=np.int64)
+        if self.weights is None:
+            return np.unique(chosen)
+        touched = np.zeros(self.weights.shape[0])
+        touched[chosen] = 1.0
+        return np.flatnonzero(self.weights.T @ touched > _NO_WEIGHT)
+
+
+@lru_cache(maxsize=16)
+def outer(body: Body) -> Outer:
+    """The organ's own surface: the skin where the body has one, else the boundary of its cells; kept for each body.
+
+    Args:
+        body: the body at rest.
+    """
+    if body.skin is None:
+        return Outer(body.boundary_surface, None)
+    return Outer(body.skin, embed(body, body.skin.points).matrix)
+
+
+def outer_nodes(body: Body) -> Ints:
+    """Numbers of the nodes that move the organ's own surface, sorted.
+
+    Args:
+        body: the body.
+    """
+    return body.boundary_nodes if body.skin is None else outer(body).nodes_of(outer(body).vertices)
 
 
 def carried(body: Body, displacement: ArrayLike) -> dict[str, Surface]:

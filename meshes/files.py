@@ -44,6 +44,7 @@ _VTK_NODES = {kind.vtk: (kind.name, kind.nodes) for kind in KINDS.values()}
 _LAST_LINES = 100  # of a text cloud, to see how its numbers end
 _HEAD = 2048  # bytes in which a file says what it is
 _FRACTIONS = "fraction"
+_SKIN = ("skin_points", "skin_triangles")
 _MARK = "softtwin body"
 _PLAIN = " :()[]/,=+@"
 _PREFIXES = ("node_set:", "surface:", "inner_points:", "inner_triangles:")
@@ -207,6 +208,9 @@ def write_body(path: str | Path, body: Body, fields: Mapping[str, ArrayLike] | N
         _add(grid.GetFieldData(), f"inner_triangles:{name}", surface.triangles)
     if body.fractions is not None:
         _add(grid.GetCellData(), _FRACTIONS, body.fractions)
+    if body.skin is not None:
+        _add(grid.GetFieldData(), _SKIN[0], body.skin.points)
+        _add(grid.GetFieldData(), _SKIN[1], body.skin.triangles)
     _add(grid.GetFieldData(), _MARK, np.array([1]))
     _write(Path(path), grid)
 
@@ -236,7 +240,8 @@ def read_body(path: str | Path) -> Body:
     positions = vtk_to_numpy(grid.GetPoints().GetData())[:, : kind.dimension]
     fractions = grid.GetCellData().GetArray(_FRACTIONS)
     whole = None if fractions is None else vtk_to_numpy(fractions)
-    return Body(positions, blocks[kind.name], sets, surfaces, inner, whole)
+    skin = Surface(*(vtk_to_numpy(arrays[name]) for name in _SKIN)) if _SKIN[0] in arrays else None
+    return Body(positions, blocks[kind.name], sets, surfaces, inner, whole, skin)
 
 
 def read_fields(path: str | Path) -> dict[str, NDArray[Any]]:

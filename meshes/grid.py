@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -40,8 +40,8 @@ class SparseGrid:
     a cell with its fraction.
 
     Args:
-        body: the hexahedra, with their fractions. Its `fixed` nodes are all nodes of the cells that hold a fixed
-            vertex, so that such a vertex cannot move at all; other sets likewise.
+        body: the hexahedra, with their fractions; the surface is its skin. Its `fixed` nodes are all nodes of the
+            cells that hold a fixed vertex, so that such a vertex cannot move at all; other sets likewise.
         surface: the embedded surface at rest.
         weights: the row of a surface vertex holds the trilinear weights of its cell's 8 nodes, (v, n); they sum to 1.
         index: position of each cell in the enclosing grid, (m, 3).
@@ -157,6 +157,7 @@ def sparse_grid(
         cells,
         {name: around[members].ravel() for name, members in sets.items()},
         fractions=np.maximum(share, smallest)[kept],
+        skin=surface,
     )
     return SparseGrid(
         body=body,
@@ -167,6 +168,33 @@ def sparse_grid(
         origin=origin,
         spacing=edges,
     )
+
+
+def gridded(
+    body: Body, spacing: float | None = None, cells_per_axis: Sequence[int] | None = None, smallest: float = 0.1
+) -> Body:
+    """A body on a regular grid instead of its own cells: its boundary becomes the skin, its sets and surfaces stay.
+
+    Args:
+        body: a body of tetrahedra or hexahedra with fixed nodes.
+        spacing, cells_per_axis: see `sparse_grid`.
+        smallest: see there; larger than its own, since a force on the skin moves the loose corners of a nearly empty
+            cell by much more than the organ (on a liver of 3,700 cells 1e-3 let them run fifteen times as far).
+
+    Raises:
+        BodyError, ValueError: see `sparse_grid`.
+    """
+    vertices, corners = np.unique(body.boundary, return_inverse=True)
+    numbers = np.full(len(body.points), -1)
+    numbers[vertices] = np.arange(len(vertices))
+    sets = {name: numbers[np.intersect1d(nodes, vertices)] for name, nodes in body.node_sets.items()}
+    fixed = sets.pop("fixed", np.empty(0, dtype=np.int64))
+    surface = Surface(body.points[vertices], corners.reshape(-1, 3))
+    grid = sparse_grid(
+        surface, fixed, spacing=spacing, cells_per_axis=cells_per_axis, node_sets=sets, smallest=smallest
+    )
+    surfaces = {name: numbers[triangles] for name, triangles in body.surfaces.items()}
+    return replace(grid.body, surfaces=surfaces, inner=body.inner)
 
 
 def _layout(extent: Floats, spacing: float | None, cells_per_axis: Sequence[int] | None) -> tuple[Ints, Floats]:

@@ -130,9 +130,8 @@ class Problem:
         """
         if self.error is None:
             return np.zeros(len(self.cloud))
-        corners = self.error.rest[self.observed.triangles[trial.match.triangles]]
         alike = max(len(self.cloud) / self.error.discrepancy.places, 1.0)
-        return np.sqrt(alike) * np.einsum("pk,pk->p", trial.match.weights, corners)
+        return np.sqrt(alike) * self.observed.at_points(trial.match, self.error.rest)
 
     def residuals(self, trial: Trial, noise: float) -> Floats:
         """Distances less what they are in the mean for points of some noise, (p,), metres.
@@ -189,7 +188,7 @@ class Problem:
         shifted = trial.state.moved(change[self.force_part], every)
         if self.pose is not None:
             twist = self.pose.deviations * change[self.pose_part]
-            arm = self.observed.rest[::every] - self.pose.centre
+            arm = self.observed.body.points[self.observed.nodes[::every]] - self.pose.centre
             shifted = shifted + (np.cross(twist[:3], arm) + twist[3:])
         if self.error is not None:
             shifted = shifted + self.error.observed_field(change[self.error_part], every)

@@ -7,11 +7,12 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, kron
 
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.closest import ClosestPoints
 from softtwin.meshes.curvature import mean_curvature
+from softtwin.meshes.embedding import outer
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,16 +45,30 @@ class SurfaceDistance:
 
     Args:
         body: the body.
-        triangles: the observed side as node numbers, (t, 3); the whole boundary if not given.
+        triangles: the observed side as vertex numbers of the organ's own surface (which are node numbers where that
+            is the boundary of the cells), (t, 3); all of it if not given.
     """
 
     def __init__(self, body: Body, triangles: ArrayLike | None = None) -> None:
         self.body = body
-        chosen = body.boundary if triangles is None else np.asarray(triangles, dtype=np.int64)
-        self.nodes, local = np.unique(chosen, return_inverse=True)
+        surface = outer(body)
+        chosen = surface.rest.triangles if triangles is None else np.asarray(triangles, dtype=np.int64)
+        vertices, local = np.unique(chosen, return_inverse=True)
         self.triangles = local.reshape(-1, 3)
-        self.rest: Floats = body.points[self.nodes]
-        self._closest = ClosestPoints(self.triangles, len(self.nodes))
+        self.nodes = surface.nodes_of(vertices)
+        self.rest: Floats = surface.rest.points[vertices]
+        self._weights = None if surface.weights is None else surface.weights[vertices][:, self.nodes]
+        self._closest = ClosestPoints(self.triangles, len(vertices))
+
+    def _carried(self, field: Floats) -> Floats:
+        """A field of the nodes `nodes`, (m, ...), at the vertices of the observed side, (v, ...)."""
+        return field if self._weights is None else self._weights @ field
+
+    def at_points(self, match: Match, field: Floats) -> Floats:
+        """A number of each node of `nodes`, (m,), at the closest points of a match, (p,)."""
+        corners = self._carried(field)[self.triangles[match.triangles]]
+        found: Floats = np.einsum("pk,pk->p", match.weights, corners)
+        return found
 
     def match(self, displacement: Floats, cloud: Floats, near: Match | None = None) -> Match:
         """A cloud (p, 3) matched to the surface moved by the displacement (m, 3) of the nodes `nodes`, metres.
@@ -63,7 +78,7 @@ class SurfaceDistance:
             cloud: points, (p, 3), metres.
             near: a match of the same cloud to walk from, faster; the search starts anew if not given.
         """
-        positions = self.rest + displacement
+        positions = self.rest + self._carried(displacement)
         if near is None:
             return self._matched(positions, cloud, *self._closest.find(positions, cloud))
         return self._matched(positions, cloud, *self._closest.follow(positions, cloud, near.triangles))
@@ -75,7 +90,7 @@ class SurfaceDistance:
             displacement: of the nodes `nodes`, (m, 3), metres.
             cloud: points, (p, 3), metres.
         """
-        positions = self.rest + displacement
+        positions = self.rest + self._carried(displacement)
         return self._matched(positions, cloud, *self._closest.near(positions, cloud))
 
     def match_beyond(self, displacement: Floats, cloud: Floats, near: Match, distance: float) -> Match:
@@ -90,7 +105,7 @@ class SurfaceDistance:
         far = np.flatnonzero(np.abs(near.distances) > distance) if distance > 0.0 else np.arange(len(cloud))
         if not len(far):
             return near
-        positions = self.rest + displacement
+        positions = self.rest + self._carried(displacement)
         triangles, weights = near.triangles.copy(), near.weights.copy()
         triangles[far], weights[far] = self._closest.find(positions, cloud[far])
         return self._matched(positions, cloud, triangles, weights)
@@ -121,7 +136,16 @@ class SurfaceDistance:
         columns = (3 * self.triangles[match.triangles][:, :, None] + np.arange(3)).reshape(count, 9)
         values = (match.weights[:, :, None] * match.directions[:, None, :]).reshape(count, 9)
         indptr = np.arange(0, 9 * count + 1, 9)
-        return csr_array((values.ravel(), columns.ravel(), indptr), shape=(count, 3 * len(self.nodes)))
+        return self.by_nodes(csr_array((values.ravel(), columns.ravel(), indptr), shape=(count, 3 * len(self.rest))))
+
+    def by_nodes(self, rows: csr_array) -> csr_array:
+        """Linear functions of the displacement of the nodes `nodes`, (q, 3m), from those of the vertices', (q, 3v)."""
+        return rows if self._spread is None else rows @ self._spread
+
+    @cached_property
+    def _spread(self) -> csr_array | None:
+        """Displacements of the vertices from those of the nodes, (3v, 3m); None where they are the same."""
+        return None if self._weights is None else csr_array(kron(self._weights, np.eye(3), format="csr"))
 
     def expected(self, match: Match, noise: float) -> Floats:
         """Mean of the signed distances of points that noise has moved from where they were matched, (p,), metres.
@@ -144,7 +168,7 @@ class SurfaceDistance:
 
     @cached_property
     def normals(self) -> tuple[Floats, Floats]:
-        """Normal, (m, 3), and share of the observed side's area, (m,), of each observed node at rest."""
+        """Normal, (v, 3), and share of the observed side's area, (v,), of each vertex of it at rest."""
         corners = self.rest[self.triangles]
         areas = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         sums, share = np.zeros_like(self.rest), np.zeros(len(self.rest))

@@ -11,6 +11,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.embedding import outer_nodes
 
 from .evidence import Scale
 from .forward import Discrepancy, ReducedModel
@@ -104,7 +105,7 @@ def nodal_forces(body: Body, nodes: ArrayLike, scale: Scale = FORCE, smoothness:
     """
     if not 0.0 <= smoothness < np.inf:
         raise ValueError(f"nodal_forces.smoothness: expected a length of 0 m or more, got {smoothness}.")
-    chosen = np.setdiff1d(np.intersect1d(np.asarray(nodes, dtype=np.int64), body.boundary_nodes), body.fixed)
+    chosen = np.setdiff1d(np.intersect1d(np.asarray(nodes, dtype=np.int64), outer_nodes(body)), body.fixed)
     if len(chosen) == 0:
         raise ValueError(
             f"nodal_forces.nodes: expected nodes on the free boundary, none of the {np.size(nodes)} given is; "
@@ -206,13 +207,14 @@ def contact(forces: Forces, nodal: Floats, positions: Floats, reach: float, leas
 
 
 def _observing_rows(observed: SurfaceDistance) -> csr_array:
-    """Root mean square movement of the observed side as rows, (3m, 3m): along the normal, and less across it."""
+    """Root mean square movement of the observed side as rows, (3v, 3m): along the normal, and less across it."""
     normals, share = observed.normals
     count = len(normals)
     blocks = _TANGENTIAL * np.eye(3) + (1.0 - _TANGENTIAL) * normals[:, :, None] * normals[:, None, :]
     blocks *= np.sqrt(share)[:, None, None]
     columns = np.repeat((3 * np.arange(count)[:, None] + np.arange(3))[:, None, :], 3, axis=1)
-    return csr_array((blocks.ravel(), columns.ravel(), np.arange(0, 9 * count + 1, 3)), shape=(3 * count, 3 * count))
+    indptr = np.arange(0, 9 * count + 1, 3)
+    return observed.by_nodes(csr_array((blocks.ravel(), columns.ravel(), indptr), shape=(3 * count, 3 * count)))
 
 
 @dataclass(frozen=True, eq=False)

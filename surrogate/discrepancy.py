@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from softtwin.meshes.embedding import outer_nodes
 from softtwin.reference.data.dataset import DataSet, Samples
 
 from .model import Surrogate
@@ -58,7 +59,7 @@ def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 32) -> Sur
     modes, sizes = _modes(missing, most)
     rest = np.sqrt((left_out**2).mean(axis=0).reshape(-1, 3).mean(axis=1))
     maps = replace(surrogate.maps, error_modes=modes * sizes, error_rest=rest)
-    seen = left_out.reshape(len(missing), -1, 3)[:, data.body.boundary_nodes]
+    seen = left_out.reshape(len(missing), -1, 3)[:, outer_nodes(data.body)]
     card = {**surrogate.card, "discrepancy": {"samples": len(missing), "bounded": bounded, "places": _places(seen)}}
     return Surrogate(surrogate.body, maps, surrogate.network, card)
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softtwin.meshes.embedding import outer_nodes
 from softtwin.meshes.metrics import nodal_distances, relative_error, thesis_error
 from softtwin.reference.data.dataset import DataSet, Samples, Split, probe_cotangents
 from softtwin.reference.data.schema import Reason
@@ -171,7 +172,7 @@ def registration_cosines(surrogate: Surrogate, data: DataSet, samples: Samples, 
     """
     if len(samples) < 2:
         raise ValueError(f"registration_cosines.samples: expected at least 2, got {len(samples)}.")
-    loaded, boundary = data.response.loaded, data.body.boundary_nodes
+    loaded, boundary = data.response.loaded, outer_nodes(data.body)
     forces, cotangent = np.zeros_like(data.body.points), np.zeros_like(data.body.points)
     cosines = np.empty(len(samples))
     for i, (here, there) in enumerate(zip(samples.displacements, np.roll(samples.displacements, -1, 0), strict=True)):

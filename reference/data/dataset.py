@@ -16,6 +16,7 @@ import zarr
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body, Surface
+from softtwin.meshes.embedding import outer
 
 from . import schema
 from .materials import MATERIALS, Material
@@ -121,6 +122,7 @@ class DataSet:
                 for name in names["inner"]
             },
             fractions=self._array("body/fractions") if names.get("fractions") else None,
+            skin=Surface(*(self._array(f"body/skin/{part}") for part in _SKIN)) if names.get("skin") else None,
         )
         if body.fingerprint != names["fingerprint"]:
             raise DataSetError(
@@ -287,6 +289,7 @@ class DataSet:
         return values
 
 
+_SKIN = ("points", "triangles")
 _BEYOND_REPAIR = (
     "truncated or changed. Bring a copy back, or make the whole data set again (`softtwin generate --again`)."
 )
@@ -318,11 +321,13 @@ def create(
         "surfaces": sorted(body.surfaces),
         "inner": sorted(body.inner),
         "fractions": body.fractions is not None,
+        "skin": body.skin is not None,
         "fingerprint": body.fingerprint,
     }
     root = zarr.create_group(str(path), zarr_format=3, overwrite=True)
     arrays = {"body/points": body.points, "body/cells": body.cells}
     arrays |= {} if body.fractions is None else {"body/fractions": body.fractions}
+    arrays |= {} if body.skin is None else {f"body/skin/{part}": getattr(body.skin, part) for part in _SKIN}
     arrays |= {f"body/sets/{name}": nodes for name, nodes in body.node_sets.items()}
     arrays |= {f"body/surfaces/{name}": triangles for name, triangles in body.surfaces.items()}
     for name, surface in body.inner.items():
@@ -381,6 +386,10 @@ def drop_block(path: Path, block: int) -> None:
 
 def probe_cotangents(body: Body, shapes: Floats, probes: Floats) -> Floats:
     """The cotangents that probes (s, k) stand for, (s, n, 3): modes on the boundary, as residuals of a registration."""
+    surface = outer(body)
+    if surface.weights is not None:
+        seen = np.stack([surface.spread(surface.carried(shape)) for shape in shapes])
+        return np.tensordot(probes, seen, axes=1)
     cotangents = np.zeros((len(probes), *body.points.shape))
     nodes = body.boundary_nodes
     cotangents[:, nodes] = np.tensordot(probes, shapes[:, nodes], axes=1)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.embedding import outer, outer_nodes
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -71,15 +72,15 @@ def check_loads(body: Body, plan: LoadPlan) -> None:
 
 
 def loaded_nodes(body: Body, plan: LoadPlan) -> Ints:
-    """Numbers of the nodes that may carry force, sorted: the free boundary nodes of the zones.
+    """Numbers of the nodes that may carry force, sorted: the free nodes of the zones that move the organ's surface.
 
     Raises:
         ValueError: a zone that the body lacks, or no free node on the boundary or in the zones.
     """
-    allowed = np.setdiff1d(body.boundary_nodes, body.fixed)
+    allowed = np.setdiff1d(outer_nodes(body), body.fixed)
     if len(allowed) == 0:
         raise ValueError(
-            f"Body.fixed: expected free nodes on the boundary, got all {len(body.boundary_nodes)} of them fixed; "
+            f"Body.fixed: expected free nodes on the boundary, got all {len(outer_nodes(body))} of them fixed; "
             "nothing is left that a load could act on."
         )
     if not plan.zones:
@@ -89,7 +90,7 @@ def loaded_nodes(body: Body, plan: LoadPlan) -> Ints:
         raise ValueError(f"LoadPlan.zones: expected names among {sorted(body.node_sets)}, got {missing}.")
     zones = np.unique(np.concatenate([body.node_sets[name] for name in plan.zones]))
     nodes = np.intersect1d(zones, allowed)
-    if len(nodes) == 0:
+    if len(outer(body).vertices_of(nodes)) == 0:
         raise ValueError(f"LoadPlan.zones: none of the {len(zones)} nodes of {plan.zones} is on the free boundary.")
     return nodes
 
@@ -103,23 +104,29 @@ def draw_load(body: Body, shapes: Floats, plan: LoadPlan, rng: np.random.Generat
         plan: how loads are drawn.
         rng: source of chance; the load is a function of it alone.
     """
-    forces = np.zeros_like(body.points)
+    surface = outer(body)
+    forces = np.zeros_like(surface.rest.points)
     for _ in range(rng.integers(1, plan.patches + 1)):
         patch = _draw_patch(body, plan, rng)
         if plan.kind == "modal":
             q = rng.uniform(-1.0, 1.0, plan.modes)
-            forces[patch] += np.einsum("k,kni->ni", q, shapes[: plan.modes, patch])
+            shape = np.einsum("k,kni->ni", q, shapes[: plan.modes])
+            forces[patch] += surface.carried(shape)[patch]
         else:
             forces[patch] += rng.uniform(-1.0, 1.0, (len(patch), 3))
+    if surface.weights is not None:
+        forces = surface.spread(forces)
+        forces[np.setdiff1d(np.arange(len(forces)), loaded_nodes(body, plan))] = 0.0
     return forces
 
 
 def _draw_patch(body: Body, plan: LoadPlan, rng: np.random.Generator) -> Ints:
-    """Nodes of a zone in a ball of random centre and radius; never empty, for the centre is a node."""
+    """Vertices of a zone in a ball of random centre and radius; never empty, for the centre is one of them."""
     zone = loaded_nodes(body, plan)
     if plan.zones:
         zone = np.intersect1d(body.node_sets[plan.zones[rng.integers(len(plan.zones))]], zone)
-    positions = body.points[zone]
+    zone = outer(body).vertices_of(zone)
+    positions = outer(body).rest.points[zone]
     centre = positions[rng.integers(len(zone))]
     radius = rng.uniform(*plan.radius) * float(np.linalg.norm(np.ptp(positions, axis=0)))
     return zone[np.linalg.norm(positions - centre, axis=1) <= radius]
