@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista
 
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 pytest.importorskip("torch", reason="torch is absent")
@@ -23,8 +24,11 @@ from softtwin.app.doctor import available_cores
 from softtwin.app.stages.learn import train_stage
 from softtwin.app.workspace import locked, open_workspace, read_records, timed
 from softtwin.meshes.body import Body
+from softtwin.meshes.clouds import partial_view
+from softtwin.meshes.embedding import outer
 from softtwin.meshes.files import read_body, write_body
 from softtwin.meshes.shapes import beam
+from softtwin.reference.data.dataset import DataSet
 
 ENTRIES = {
     "folder": ".",
@@ -364,3 +368,26 @@ def test_two_trainings_in_one_folder_are_one_too_many(copy: Path, monkeypatch: p
         train_stage(space)
     with locked(space, "train"):
         pass  # let go of
+
+
+def test_a_twin_on_a_regular_grid_registers_clouds_of_the_surface(capsys, tmp_path: Path) -> None:
+    """`build --grid`: the surface rides in hexahedra, which U-Mesh learns on too; clouds are matched to it."""
+    write_files(tmp_path, bar())
+    out = tmp_path / "out"
+    words = ["build", tmp_path / "beam.vtu", "--samples", 24, "--seconds", 2, "--ranks", 1, "--grid", 0.08]
+    said = run(capsys, *words, "--fixed", tmp_path / "fixed.txt", "--displacement", 0.05, "--output", out)
+    assert "hexahedra of 80 mm" in said
+    body = read_body(out / "body.vtu")
+    assert body.kind.name == "hexahedron" and len(body.skin.points) == len(bar().boundary_nodes)
+    truth = DataSet(out / "data.zarr").samples("test", 1).displacements[0]
+    cloud = partial_view(body, truth, (0.0, -1.0, 0.5), 400, 0.0, np.random.default_rng(0))
+    np.save(tmp_path / "cloud.npy", cloud)
+    run(capsys, "register", out, tmp_path / "cloud.npy", "--output", tmp_path / "found", "--format", "vtp")
+    moved = pyvista.read(tmp_path / "found" / "organ_0000.vtp").points
+    apart = np.linalg.norm(moved - outer(body).moved(truth).points, axis=1)
+    assert apart.mean() < 0.2 * np.linalg.norm(outer(body).carried(truth), axis=1).mean()
+    edit(out, 'architecture = "reduced"', 'architecture = "umesh"')
+    edit(out, "settings = {}", "settings = { channels = 2, levels = 1 }")
+    run(capsys, "train", out / "organ.toml", "--fresh")
+    assert "umesh" in (out / "twin" / "surrogate.json").read_text()
+    run(capsys, "validate", out / "organ.toml")

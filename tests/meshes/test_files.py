@@ -1,4 +1,5 @@
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -18,6 +19,7 @@ from softtwin.meshes.files import (
     write_body,
     write_deformed,
 )
+from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam
 
 LIVER = Path(__file__).parents[2].parent / "shared" / "data" / "liver"
@@ -218,7 +220,18 @@ def test_fractions_come_back_bit_for_bit(tmp_path: Path) -> None:
     write_body(tmp_path / "body.vtu", sparse)
     _equal(sparse, read_body(tmp_path / "body.vtu"))
     write_body(tmp_path / "plain.vtu", plain)
-    assert read_body(tmp_path / "plain.vtu").fractions is None
+    read = read_body(tmp_path / "plain.vtu")
+    assert read.fractions is None and read.skin is None
+
+
+def test_a_skin_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    body = gridded(beam((4, 2, 2), (0.4, 0.2, 0.2), "tetrahedron"), 0.07)
+    body = replace(body, surfaces={"observed": body.skin.triangles[:7]})
+    write_body(tmp_path / "body.vtu", body)
+    read = read_body(tmp_path / "body.vtu")
+    _equal(body, read)
+    assert np.array_equal(read.skin.points, body.skin.points)
+    assert np.array_equal(read.skin.triangles, body.skin.triangles)
 
 
 def test_the_liver_phantom_comes_back_bit_for_bit(tmp_path: Path, liver: Body) -> None:

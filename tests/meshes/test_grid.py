@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from softtwin.meshes.body import Body, BodyError, Surface
 from softtwin.meshes.checks import compacted
-from softtwin.meshes.grid import SparseGrid, sparse_grid
+from softtwin.meshes.embedding import outer, outer_nodes
+from softtwin.meshes.grid import SparseGrid, gridded, sparse_grid
 from softtwin.meshes.shapes import beam
 
 EPS = np.finfo(float).eps
@@ -255,3 +256,44 @@ def test_a_field_of_another_grid_is_refused(grid: SparseGrid) -> None:
         grid.carry(np.zeros((7, 3)))
     with pytest.raises(ValueError, match=r"forces: expected shape \(\d+, 3\), got \(7, 3\)"):
         grid.spread(np.zeros((7, 3)))
+
+
+def test_a_gridded_body_keeps_its_surface_sets_and_inner_structures(liver: Body) -> None:
+    seen = liver.boundary[::2]
+    held = liver.boundary_nodes[liver.points[liver.boundary_nodes, 0] > 0.08]
+    liver = Body(liver.points, liver.cells, {**liver.node_sets, "held": held}, {"observed": seen}, liver.inner)
+    body = gridded(liver, 0.012)
+    surface = outer(body)
+    assert body.kind.name == "hexahedron" and body.inner.keys() == liver.inner.keys()
+    assert body.volume == pytest.approx(liver.volume, rel=0.02)
+    assert np.array_equal(surface.rest.points[surface.rest.triangles], liver.points[liver.boundary])
+    assert np.array_equal(surface.rest.points[body.surfaces["observed"]], liver.points[seen])
+    assert np.isin(liver.points[held], surface.rest.points[surface.vertices_of(body.node_sets["held"])]).all()
+
+
+def test_the_skin_follows_its_cells_and_gives_them_its_forces(liver: Body) -> None:
+    body = gridded(liver, 0.012)
+    surface, rng = outer(body), np.random.default_rng(2)
+    skin = surface.rest.points
+    assert np.abs(surface.moved(body.points @ TURN).points - (skin + skin @ TURN)).max() < 1e4 * EPS
+    forces = rng.standard_normal(skin.shape)
+    nodal = surface.spread(forces)
+    assert np.allclose(nodal.sum(axis=0), forces.sum(axis=0), atol=1e3 * EPS)
+    moments = (np.cross(points, f).sum(axis=0) for points, f in ((body.points, nodal), (skin, forces)))
+    assert np.allclose(*moments, atol=1e3 * EPS)
+    touched = np.flatnonzero(nodal.any(axis=1))
+    assert np.array_equal(touched, outer_nodes(body)) and len(touched) < len(body.points)
+    held = surface.vertices_of(body.fixed)
+    still = np.where(np.isin(np.arange(len(body.points)), body.fixed)[:, None], 0.0, rng.standard_normal((1, 3)))
+    assert len(held) and not surface.carried(still)[held].any()
+
+
+def test_without_a_skin_the_boundary_is_the_surface(liver: Body) -> None:
+    surface = outer(liver)
+    assert surface.weights is None and outer(liver) is surface
+    assert np.array_equal(surface.rest.triangles, liver.boundary)
+    assert np.array_equal(outer_nodes(liver), liver.boundary_nodes)
+    assert np.array_equal(surface.vertices_of(liver.fixed), np.intersect1d(liver.fixed, liver.boundary_nodes))
+    field = np.ones_like(liver.points)
+    assert surface.carried(field) is field and surface.spread(field) is field
+    assert np.array_equal(surface.nodes_of([5, 3, 5]), [3, 5])

@@ -171,6 +171,7 @@ def test_a_sparse_grid_is_carried_from_the_body_to_the_data_and_its_physics(tmp_
     """Cells cut in half count half: in the equilibria, in what is stored, and in torch."""
     torch = pytest.importorskip("torch", reason="torch is absent")
     from softtwin.meshes.checks import compacted
+    from softtwin.meshes.embedding import outer_nodes
     from softtwin.meshes.grid import sparse_grid
     from softtwin.surrogate.residual import ElasticBody
 
@@ -181,6 +182,9 @@ def test_a_sparse_grid_is_carried_from_the_body_to_the_data_and_its_physics(tmp_
     plan = replace(PLAN, samples={"train": 3, "validation": 3, "test": 3})
     data = generate(tmp_path / "data.zarr", grid.body, plan)
     assert data is not None and np.array_equal(data.body.fractions, grid.fractions)
+    assert np.array_equal(data.body.skin.points, surface.points)
+    assert np.array_equal(data.body.skin.triangles, surface.triangles)
+    assert np.array_equal(data.response.loaded, np.setdiff1d(outer_nodes(grid.body), grid.body.fixed))
     samples = data.samples("train")
     forces = np.zeros((len(samples), *data.body.points.shape))
     forces[:, data.response.loaded] = samples.forces

@@ -9,6 +9,9 @@ import pytest
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.closest import ClosestPoints, closest_in_triangles
+from softtwin.meshes.clouds import partial_view
+from softtwin.meshes.embedding import outer_nodes
+from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
@@ -16,6 +19,7 @@ from softtwin.registration.gauss_newton import LocalModel
 from softtwin.registration.loss import Huber
 from softtwin.registration.pose import Pose
 from softtwin.registration.problem import Problem
+from softtwin.registration.registrar import prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.thinning import thinned
 from softtwin.registration.unknowns import PosePrior, nodal_forces
@@ -28,7 +32,38 @@ def observed(body: Body) -> SurfaceDistance:
     return SurfaceDistance(body, body.surfaces["observed"])
 
 
-def test_rows_are_the_derivative_of_the_distances(body: Body, observed: SurfaceDistance, rng) -> None:
+@pytest.fixture(scope="module")
+def carried(body: Body) -> Body:
+    """The same organ carried by the cells of a regular grid."""
+    return gridded(body, 0.09)
+
+
+def test_a_surface_that_cells_carry_is_where_it_was(body: Body, carried: Body, observed, rng) -> None:
+    cloud = cloud_on(body, np.zeros_like(body.points), 80, rng, noise=5e-3)
+    skin = SurfaceDistance(carried, carried.surfaces["observed"])
+    rest = observed.match(np.zeros((len(observed.nodes), 3)), cloud)
+    same = skin.match(np.zeros((len(skin.nodes), 3)), cloud)
+    assert np.allclose(same.distances, rest.distances, atol=1e-12)
+    height = carried.points[skin.nodes, 2]
+    assert np.allclose(skin.at_points(same, height), skin.feet(same)[:, 2], atol=1e-12)
+
+
+def test_forces_on_a_grid_are_found_from_a_cloud_of_its_skin(carried: Body, rng) -> None:
+    model = Cantilever(carried)
+    forces = np.zeros_like(carried.points)
+    tip = np.flatnonzero(carried.points[:, 0] > 0.75)
+    forces[np.intersect1d(tip, outer_nodes(carried)), 1] = 0.02
+    truth = model.solve(forces).displacement
+    cloud = partial_view(carried, truth, (0.0, 1.0, 1.0), 300, 0.0, rng, "observed")
+    result = prepare(model, tip, carried.surfaces["observed"], force_scale=0.02).register(cloud)
+    errors = np.linalg.norm(result.displacement - truth, axis=1)
+    assert errors.mean() < 0.02 * np.linalg.norm(truth, axis=1).mean()
+
+
+@pytest.mark.parametrize("on_a_grid", [False, True])
+def test_rows_are_the_derivative_of_the_distances(on_a_grid: bool, body: Body, carried: Body, observed, rng) -> None:
+    if on_a_grid:
+        observed = SurfaceDistance(carried, carried.surfaces["observed"])
     cloud = cloud_on(body, np.zeros_like(body.points), 80, rng, noise=5e-3)
     u = 1e-3 * rng.standard_normal((len(observed.nodes), 3))
     direction = rng.standard_normal(u.shape)
