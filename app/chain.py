@@ -24,7 +24,9 @@ from .workspace import Workspace, open_workspace, write_whole
 Say = Callable[[str], None]
 
 
-def build_twin(config: Config, output: Path, say: Say, again: bool = False, device: Device = "auto") -> Workspace:
+def build_twin(
+    config: Config, output: Path, say: Say, again: bool = False, device: Device = "auto", processes: int = 1
+) -> Workspace:
     """Mesh, generate, train and validate.
 
     Args:
@@ -33,12 +35,13 @@ def build_twin(config: Config, output: Path, say: Say, again: bool = False, devi
         say: prints a line.
         again: throw away equilibria that were solved there before.
         device: where to train.
+        processes: that train together.
 
     Raises:
         ConfigError: equilibria were solved there with another configuration or other files.
     """
     space = prepare(config, output, again)
-    make_twin(space, output / "organ.toml", say, again, device)
+    make_twin(space, output / "organ.toml", say, again, device, processes)
     say(f"\ntwin: {space.twin}")
     say(f"next: softtwin register {space.twin} CLOUDS...   and: softtwin report {output / 'organ.toml'}")
     say(NOTICE)
@@ -64,7 +67,9 @@ def prepare(config: Config, output: Path, again: bool = False) -> Workspace:
     return open_workspace(output / "organ.toml")
 
 
-def make_twin(space: Workspace, path: Path, say: Say, again: bool = False, device: Device = "auto") -> None:
+def make_twin(
+    space: Workspace, path: Path, say: Say, again: bool = False, device: Device = "auto", processes: int = 1
+) -> None:
     """The stages up to the validated twin, each only where its result is missing or of other inputs.
 
     Args:
@@ -73,11 +78,14 @@ def make_twin(space: Workspace, path: Path, say: Say, again: bool = False, devic
         say: prints a line.
         again: throw away equilibria that were solved before.
         device: where to train.
+        processes: that train together.
 
     Raises:
         ConfigError: equilibria were solved there on another mesh.
     """
-    training_plan(space.config.training, device)  # refused before the hour that the equilibria take, and not after it
+    training_plan(
+        space.config.training, device, processes
+    )  # refused before the hour that the equilibria take, and not after it
     say(f"1/4 mesh: {space.config.body.source}")
     body = _mesh(space, say)
     say(f"    {len(body.points)} nodes, {len(body.cells)} cells, {len(body.fixed)} fixed, {1e3 * body.volume:.2f} l")
@@ -87,10 +95,10 @@ def make_twin(space: Workspace, path: Path, say: Say, again: bool = False, devic
     _generate(space, body, path, say, again)
     say("3/4 train: the surrogate")
     try:
-        train_stage(space, device=device)
+        train_stage(space, device=device, processes=processes)
     except CheckpointError as error:
         say(f"    from the start: {str(error).partition(';')[0].removeprefix('train.folder: ')}")
-        train_stage(space, fresh=True, device=device)
+        train_stage(space, fresh=True, device=device, processes=processes)
     say("4/4 validate: held-out errors")
     say(validate_stage(space))
 

@@ -32,6 +32,13 @@ _DEVICE = click.option(
     show_default=True,
     help="Where to train; auto: on a GPU where torch sees one.",
 )
+_PROCESSES = click.option(
+    "--processes",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Processes that train together: a GPU each, or cores of this machine.",
+)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -95,13 +102,14 @@ def generate(configuration: Path, redo: tuple[int, ...], again: bool) -> None:
 @click.argument("configuration", type=_EXISTING)
 @click.option("--fresh", is_flag=True, help="Throw earlier checkpoints away instead of going on from them.")
 @_DEVICE
-def train(configuration: Path, fresh: bool, device: Any) -> None:
+@_PROCESSES
+def train(configuration: Path, fresh: bool, device: Any, processes: int) -> None:
     """Train the surrogate of CONFIGURATION on its data set and write the twin. Goes on from the last checkpoint."""
     from .stages.learn import train_stage
     from .workspace import open_workspace
 
     space = open_workspace(configuration)
-    train_stage(space, fresh, device)
+    train_stage(space, fresh, device, processes)
     click.echo(f"twin written to {space.twin}")
 
 
@@ -253,6 +261,7 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 )
 @click.option("--ranks", type=int, default=0, help="MPI ranks; 0: one a core.")
 @_DEVICE
+@_PROCESSES
 @click.option(
     "--output", type=_PATH, default=Path("twin-run"), show_default=True, help="Folder of everything that is made."
 )
@@ -305,7 +314,7 @@ def build(
         },
         "training": {"seconds": given["seconds"]},
     }
-    build_twin(parse_config(entries, "command line"), output, click.echo, again, given["device"])
+    build_twin(parse_config(entries, "command line"), output, click.echo, again, given["device"], given["processes"])
 
 
 def _named(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:

@@ -148,6 +148,9 @@ class TrainingSection(_Section):
     )
     epochs: int = Field(0, ge=0, description="passes over the samples instead, whatever time they take; 0: by seconds")
     seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
+    precision: Literal["single", "mixed"] = Field(
+        "single", description="mixed: products in bfloat16, for large networks on a GPU"
+    )
     patience: int = Field(
         0, ge=0, description="end after so many of the 40 rounds without a smaller validation error; 0: never early"
     )

@@ -17,10 +17,8 @@ from softtwin.reference.data.samplers import LoadPlan
 from .config import Config, ConfigError
 from .workspace import Workspace, read_records
 
-_LATER = {
-    "training.patience": 0,
-    "body.grid": 0.0,
-}  # entries that older records lack: at their default they change nothing
+# Entries that older records lack: at their default they change nothing.
+_LATER = {"training.patience": 0, "training.precision": "single", "body.grid": 0.0}
 _MATERIAL = {"law": "material", "young_modulus": "young_modulus", "poisson_ratio": "poisson_ratio"}
 
 

@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
-from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 from tqdm import tqdm
 
@@ -28,6 +29,7 @@ from .plan import TrainingPlan
 ROUNDS = 40  # a round ends with a look at the validation split and a checkpoint
 _WARM_UP = 200  # steps over which the learning rate rises
 _WARM_TENTHS = 10.0
+_ADVISERS = ("lightning.pytorch", "lightning.fabric", "lightning")
 _ENDLESS = 10**9  # steps of a round that the clock ends
 
 
@@ -39,14 +41,20 @@ def chosen_device(plan: TrainingPlan) -> str:
     """Where to train.
 
     Raises:
-        ValueError: a GPU is asked for, and torch sees none.
+        ValueError: a GPU is asked for, and torch sees none, or fewer than there are processes.
     """
     if plan.device == "cuda" and not torch.cuda.is_available():
         raise ValueError(
             "TrainingPlan.device: expected a GPU that torch can use, found none (torch "
             f"{torch.__version__}); take 'cpu' or 'auto', or a build of torch with CUDA."
         )
-    return "cuda" if plan.device != "cpu" and torch.cuda.is_available() else "cpu"
+    device = "cuda" if plan.device != "cpu" and torch.cuda.is_available() else "cpu"
+    if device == "cuda" and plan.processes > torch.cuda.device_count():
+        raise ValueError(
+            f"TrainingPlan.processes: expected at most one for each of {torch.cuda.device_count()} GPUs, got "
+            f"{plan.processes}; take fewer, or the device 'cpu'."
+        )
+    return device
 
 
 def _count_steps(plan: TrainingPlan, sample_count: int) -> int | None:
@@ -79,6 +87,7 @@ class Batches:
         steps: steps of the round.
         seed: seed of the training.
         number: number of the round; with the seed it decides the order.
+        part: which part of each step's samples, of how many parts: one for each process.
     """
 
     count: int
@@ -86,6 +95,7 @@ class Batches:
     steps: int
     seed: int
     number: int
+    part: tuple[int, int] = (0, 1)
 
     def __len__(self) -> int:
         return self.steps
@@ -96,7 +106,7 @@ class Batches:
         for _ in range(self.steps):
             while len(waiting) < self.batch:
                 waiting = np.concatenate([waiting, rng.permutation(self.count)])
-            yield torch.from_numpy(waiting[: self.batch])
+            yield torch.from_numpy(waiting[: self.batch][self.part[0] :: self.part[1]])
             waiting = waiting[self.batch :]
 
 
@@ -125,6 +135,11 @@ class Course(lightning.LightningModule):
         self.seconds = 0.0
         self.steps_made = 0
 
+    def __setstate__(self, state: Any) -> None:
+        """Only a process that was started to help takes a course from another: no advice of Lightning's there."""
+        super().__setstate__(state)
+        _hush()
+
     @property
     def share(self) -> float:
         """Part of the epochs or seconds that were used, as far as the clock was looked at."""
@@ -139,7 +154,8 @@ class Course(lightning.LightningModule):
         """Sample numbers of the steps of the current round."""
         count = self.lesson.sample_count
         steps = _ENDLESS if self.steps is None else self.steps // self.rounds
-        return Batches(count, self.plan.batch_size(count), steps, self.plan.seed, self.current_epoch)
+        part = (self.global_rank, self.trainer.world_size)
+        return Batches(count, self.plan.batch_size(count), steps, self.plan.seed, self.current_epoch, part)
 
     def on_train_start(self) -> None:
         """Start the clock, where an interrupted training left it."""
@@ -147,7 +163,7 @@ class Course(lightning.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         """Find where the round ends: at the next part of the time; batches end the others."""
-        self._round_end = math.inf if self.steps is not None else (math.floor(ROUNDS * self.share) + 1) / ROUNDS
+        self._round_end = math.inf if self.steps is not None else (math.floor(self.rounds * self.share) + 1) / self.rounds
 
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> int | None:
         """Look at the clock: -1 ends the round, else the step gets its learning rate."""
@@ -184,16 +200,20 @@ class Course(lightning.LightningModule):
 
     def _log(self, error: float) -> None:
         """One line of the round, where training has a folder."""
-        if self.logger is not None:
-            rate = self.trainer.optimizers[0].param_groups[0]["lr"]
-            loss = float(self._loss) / max(self._count, 1)
-            line = {"seconds": self.seconds, "loss": loss, "validation_error": error, "learning_rate": rate}
-            self.logger.log_metrics(line, step=self.steps_made)
-            self.logger.save()
+        rate = self.trainer.optimizers[0].param_groups[0]["lr"]
+        loss = float(self._loss) / max(self._count, 1)
+        line = {"seconds": self.seconds, "loss": loss, "validation_error": error, "learning_rate": rate}
+        for logger in self.loggers:
+            logger.log_metrics(line, step=self.steps_made)
+            logger.save()
         self._loss, self._count = torch.zeros(()), 0
 
     def _look(self) -> None:
-        self.seconds = self.clock() - self._origin
+        """Of several processes the first has the clock, so that all end a round at the same step."""
+        seconds = torch.tensor(self.clock() - self._origin, dtype=torch.float64, device=self.device)
+        if self.trainer.world_size > 1:
+            torch.distributed.broadcast(seconds, src=0)
+        self.seconds = float(seconds)
         self.steps_made = self.trainer.global_step
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -252,7 +272,7 @@ def fit(course: Course, path: Path, resume: bool, log: bool = False) -> None:
         course: what to train.
         path: of the checkpoint.
         resume: go on from it.
-        log: leave a CSV file beside it with a line for each round, in a folder of its own for each run.
+        log: leave a line for each round beside it, as CSV and for TensorBoard, in a folder of its own for each run.
     """
     with _quiet(), _interruptible():
         keeper = ModelCheckpoint(
@@ -261,38 +281,57 @@ def fit(course: Course, path: Path, resume: bool, log: bool = False) -> None:
             save_on_train_epoch_end=True,
             enable_version_counter=False,
         )
+        device, several = chosen_device(course.plan), course.plan.processes > 1
         trainer = lightning.Trainer(
-            accelerator="gpu" if chosen_device(course.plan) == "cuda" else "cpu",
-            devices=1,
+            accelerator="gpu" if device == "cuda" else "cpu",
+            devices=course.plan.processes,
+            strategy=_together(device) if several else "auto",
+            precision="bf16-mixed" if course.plan.precision == "mixed" else "32-true",
+            use_distributed_sampler=False,
             plugins=LightningEnvironment(),  # else it looks for MPI and starts it
             max_epochs=course.rounds,
             reload_dataloaders_every_n_epochs=1,
             callbacks=[keeper, _Progress()],
-            logger=CSVLogger(path.parent, name="logs") if log else False,
+            logger=_logs(path.parent) if log else False,
             enable_progress_bar=False,
             enable_model_summary=False,
             default_root_dir=path.parent,
         )
         trainer.fit(course, ckpt_path=path if resume else None)
+    if several:  # what the others did is in the checkpoint alone
+        course.take_back(torch.load(path, map_location="cpu", weights_only=True)["course"])
+
+
+def _together(device: str) -> DDPStrategy:
+    return DDPStrategy(start_method="spawn", process_group_backend="nccl" if device == "cuda" else "gloo")
+
+
+def _logs(folder: Path) -> list[Logger]:
+    table = CSVLogger(folder, name="logs")
+    return [table, TensorBoardLogger(folder, name="logs", version=f"version_{table.version}")]
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Without Lightning's advice: its hints on hardware, loaders and folders are no concern of the user here."""
-    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric", "lightning")]
+    loggers = [logging.getLogger(name) for name in _ADVISERS]
     levels = [logger.level for logger in loggers]
     try:
-        for logger in loggers:
-            logger.setLevel(logging.ERROR)
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
-            warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated", category=FutureWarning)
-            warnings.filterwarnings("ignore", category=UserWarning, module=r"lightning\.")
-            warnings.filterwarnings("ignore", category=DeprecationWarning, module=r"lightning\.")
+            _hush()
             yield
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
+
+
+def _hush() -> None:
+    for name in _ADVISERS:
+        logging.getLogger(name).setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
+    warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated", category=FutureWarning)
+    warnings.filterwarnings("ignore", category=UserWarning, module=r"lightning\.")
+    warnings.filterwarnings("ignore", category=DeprecationWarning, module=r"lightning\.")
 
 
 @contextmanager

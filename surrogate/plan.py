@@ -11,6 +11,7 @@ from .physics import Physics
 from .reduced import Reduced
 
 Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["single", "mixed"]
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,10 @@ class TrainingPlan:
         seed: seed of weights and batches.
         physics: what is asked of predictions beside, or instead of, the data; None for the data alone.
         patience: training ends after so many of its 40 rounds without a smaller validation error; None: never early.
+        precision: `single`, or `mixed`: products of matrices in bfloat16, which has three digits; it suits large
+            networks on a GPU, and not one that is to be right to a thousandth.
         device: where to train; `auto` takes a GPU where torch sees one.
+        processes: that share each batch, on a GPU each, or on the cores of one machine.
 
     Raises:
         ValueError: an argument out of its range.
@@ -44,10 +48,12 @@ class TrainingPlan:
     seed: int = 0
     physics: Physics | None = None
     patience: int | None = None
+    precision: Precision = "single"
     device: Device = "auto"
+    processes: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch", "samples", "patience"):
+        for name in ("epochs", "batch", "samples", "patience", "processes"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"TrainingPlan.{name}: expected at least 1, got {value}.")
@@ -57,6 +63,8 @@ class TrainingPlan:
                 raise ValueError(f"TrainingPlan.{name}: expected a positive number, got {value}.")
         if self.device not in get_args(Device):
             raise ValueError(f"TrainingPlan.device: expected one of {get_args(Device)}, got {self.device!r}.")
+        if self.precision not in get_args(Precision):
+            raise ValueError(f"TrainingPlan.precision: expected one of {get_args(Precision)}, got {self.precision!r}.")
 
     @property
     def rate(self) -> float:
@@ -64,14 +72,15 @@ class TrainingPlan:
         return self.learning_rate or self.architecture.rate
 
     def batch_size(self, count: int) -> int:
-        """Samples a step when there are so many."""
-        return min(self.batch or self.architecture.batch, count)
+        """Samples a step when there are so many: as many for each process."""
+        each = -(-min(self.batch or self.architecture.batch, count) // self.processes)
+        return each * self.processes
 
     def entries(self) -> dict[str, Any]:
         """All settings that decide what is learned, those of the architecture among them, for cards and checkpoints."""
         kind = self.architecture
         physics = None if self.physics is None else asdict(self.physics)
-        own = {**_settings(self, "architecture", "device"), "physics": physics}
+        own = {**_settings(self, "architecture", "device", "processes"), "physics": physics}
         return {"architecture": kind.name, **_settings(kind), **own}
 
 

@@ -30,13 +30,14 @@ from ..inputs import check_trained, current_data, train_inputs, validate_inputs
 from ..workspace import Workspace, locked, timed, write_whole
 
 
-def train_stage(space: Workspace, fresh: bool = False, device: Device = "auto") -> Surrogate:
+def train_stage(space: Workspace, fresh: bool = False, device: Device = "auto", processes: int = 1) -> Surrogate:
     """Train on the data set and write the twin: body, weights, card, configuration. Goes on from the last checkpoint.
 
     Args:
         space: the workspace.
         fresh: throw earlier checkpoints away instead.
         device: where to train.
+        processes: that train together.
 
     Raises:
         ConfigError: there is no body, or one of another configuration; or another `train` is at work there.
@@ -45,13 +46,12 @@ def train_stage(space: Workspace, fresh: bool = False, device: Device = "auto") 
     """
     data, _ = current_data(space)
     with locked(space, "train"):
-        return _train(space, data, fresh, device)
+        return _train(space, data, fresh, training_plan(space.config.training, device, processes))
 
 
-def _train(space: Workspace, data: DataSet, fresh: bool, device: Device) -> Surrogate:
+def _train(space: Workspace, data: DataSet, fresh: bool, plan: TrainingPlan) -> Surrogate:
     if fresh:
         shutil.rmtree(space.training, ignore_errors=True)
-    plan = training_plan(space.config.training, device)
     with timed(space, "train", train_inputs(space, data)):
         surrogate = with_discrepancy(with_domain(train(data, plan, space.training), data), data)
         save(surrogate, space.twin)
@@ -62,17 +62,18 @@ def _train(space: Workspace, data: DataSet, fresh: bool, device: Device) -> Surr
     return surrogate
 
 
-def training_plan(section: TrainingSection, device: Device = "auto") -> TrainingPlan:
+def training_plan(section: TrainingSection, device: Device = "auto", processes: int = 1) -> TrainingPlan:
     """What [training] asks for.
 
     Args:
         section: of the configuration.
         device: where to train; it is of the machine, and not of the configuration.
+        processes: that train together; likewise.
 
     Raises:
         ConfigError: settings that the architecture does not have, or values that it refuses; weights of physics that
             there are not.
-        ValueError: a GPU is asked for and there is none.
+        ValueError: a GPU is asked for and there is none; fewer GPUs than processes.
     """
     kind: Any = ARCHITECTURES[section.architecture]
     own = {"modes": section.modes, "width": section.width} if kind is Reduced else {}
@@ -84,7 +85,9 @@ def training_plan(section: TrainingSection, device: Device = "auto") -> Training
         seed=section.seed,
         physics=physics,
         patience=section.patience or None,
+        precision=section.precision,
         device=device,
+        processes=processes,
     )
     chosen_device(plan)
     return plan

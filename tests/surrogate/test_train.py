@@ -106,6 +106,45 @@ def test_the_same_plan_gives_the_same_weights(data: DataSet, short: TrainingPlan
     assert not _same(first, train(data, replace(short, seed=1)))
 
 
+def test_two_processes_learn_what_one_learns(data: DataSet, tmp_path: Path, capfd) -> None:
+    """Two gloo processes share each batch; the mean of their gradients is that of the batch."""
+    plan = TrainingPlan(Perceptron(16), epochs=8, batch=8)
+    one, two = train(data, plan), train(data, replace(plan, processes=2), tmp_path)
+    assert two.card["training"]["steps"] == one.card["training"]["steps"]
+    assert two.card["training"]["validation_error"] == pytest.approx(one.card["training"]["validation_error"], rel=1e-3)
+    for name, weights in _weights(one).items():
+        assert np.allclose(_weights(two)[name], weights, rtol=0.02, atol=1e-3 * np.abs(weights).max(initial=0.0))
+    said = capfd.readouterr().err
+    assert "warn" not in said.lower() and "distributed" not in said
+    assert _same(two, train(data, replace(plan, processes=2), tmp_path))  # finished: nothing is trained again
+
+
+class Counted:
+    """A clock that goes on by a hundredth with each look; a second process's own would end at once."""
+
+    def __init__(self) -> None:
+        self.looks = 0.0
+
+    def __call__(self) -> float:
+        self.looks += 1.0
+        ranked = torch.distributed.is_initialized() and torch.distributed.get_rank() > 0
+        return self.looks * (10.0 if ranked else 0.01)
+
+
+def test_the_clock_of_the_first_process_ends_all(data: DataSet) -> None:
+    plan = TrainingPlan(Reduced(modes=8, width=16), seconds=1.5)
+    one, two = (train(data, replace(plan, processes=each), clock=Counted()) for each in (1, 2))
+    assert two.card["training"]["steps"] == one.card["training"]["steps"] > 40
+
+
+def test_mixed_precision_learns_too(data: DataSet) -> None:
+    plan = TrainingPlan(Perceptron(64), epochs=100)
+    single, mixed = (train(data, replace(plan, precision=each)) for each in ("single", "mixed"))
+    errors = [each.card["training"]["validation_error"] for each in (single, mixed)]
+    assert errors[0] != errors[1] and errors[1] < 1.5 * errors[0]
+    assert all(weights.dtype == np.float64 for weights in _weights(mixed).values() if weights.dtype.kind == "f")
+
+
 @pytest.mark.parametrize("budget", ["epochs", "seconds"])
 def test_training_goes_on_as_if_never_stopped(
     data: DataSet, short: TrainingPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, budget: str
@@ -281,6 +320,7 @@ def test_training_that_gets_no_better_ends_early(
     short = train(data, replace(plan, patience=3), tmp_path)
     assert short.card["training"]["steps"] < whole.card["training"]["steps"]
     (log,) = (tmp_path / "logs").glob("*/metrics.csv")
+    assert len(list(log.parent.glob("events.out.tfevents.*"))) == 1
     with log.open() as file:
         lines = list(csv.DictReader(file))
     errors = [float(line["validation_error"]) for line in lines]
