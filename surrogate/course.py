@@ -163,7 +163,9 @@ class Course(lightning.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         """Find where the round ends: at the next part of the time; batches end the others."""
-        self._round_end = math.inf if self.steps is not None else (math.floor(self.rounds * self.share) + 1) / self.rounds
+        self._round_end = (
+            math.inf if self.steps is not None else (math.floor(self.rounds * self.share) + 1) / self.rounds
+        )
 
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> int | None:
         """Look at the clock: -1 ends the round, else the step gets its learning rate."""

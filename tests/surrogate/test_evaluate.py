@@ -105,6 +105,9 @@ def test_errors_of_the_jacobian_are_those_of_its_columns(reduced: Surrogate, dat
             missed += float(((state.push(unit)[:, 0] - truth[:, column]) ** 2).sum())
         expected.append(np.sqrt(missed) / np.linalg.norm(truth))
     np.testing.assert_allclose(jacobian_errors(reduced, data, samples, lambda c, u: truth), expected, rtol=1e-9)
+    entries = (3 * loaded[:, None] + np.arange(3)).ravel()
+    estimated = jacobian_errors(reduced, data, samples, lambda c, u: truth @ c[entries], probes=400)
+    np.testing.assert_allclose(estimated, expected, rtol=0.02)
     own = {u.tobytes(): f for u, f in zip(samples.displacements, samples.forces, strict=True)}
 
     def itself(columns: np.ndarray, displacement: np.ndarray) -> np.ndarray:
