@@ -16,7 +16,7 @@ from .config import Config, ConfigError, to_toml
 from .inputs import changes, load_plan, mesh_inputs, plan_entries, solved_data
 from .launch import generate_in_parallel
 from .register import NOTICE
-from .stages.generate import describe_data
+from .stages.generate import describe_data, lacks_jacobians
 from .stages.learn import train_stage, training_plan, validate_stage
 from .stages.mesh import mesh_stage
 from .workspace import Workspace, open_workspace, write_whole
@@ -83,9 +83,7 @@ def make_twin(
     Raises:
         ConfigError: equilibria were solved there on another mesh.
     """
-    training_plan(
-        space.config.training, device, processes
-    )  # refused before the hour that the equilibria take, and not after it
+    training_plan(space.config.training, device, processes)  # refused before the hour that the equilibria take
     say(f"1/4 mesh: {space.config.body.source}")
     body = _mesh(space, say)
     say(f"    {len(body.points)} nodes, {len(body.cells)} cells, {len(body.fixed)} fixed, {1e3 * body.volume:.2f} l")
@@ -121,7 +119,8 @@ def _generate(space: Workspace, body: Body, path: Path, say: Say, again: bool) -
     found = [] if data is None else differences(data, body, plan_entries(space.config))
     if found:
         raise ConfigError(_refusal(space, found))
-    if data is not None and not data.missing_blocks() and not data.damaged_blocks():
+    whole = data is not None and not data.missing_blocks() and not data.damaged_blocks()
+    if data is not None and whole and not lacks_jacobians(space.config, data):
         say(f"    there already: {describe_data(data)}")
         return
     generate_in_parallel(path, space.config.samples.ranks, again)  # says itself what it has made

@@ -253,6 +253,7 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
     "--displacement", type=float, default=0.05, show_default=True, help="Largest displacement to learn, metres."
 )
 @click.option("--samples", type=int, default=512, show_default=True, help="Equilibria to learn from.")
+@click.option("--jacobians", is_flag=True, help="Learn from the Jacobians of the equilibria too (takes longer).")
 @click.option(
     "--path", type=int, default=1, show_default=True, help="Draws that share a load at growing sizes (cheaper)."
 )
@@ -311,6 +312,7 @@ def build(
             "test": max(8, given["samples"] // 4),
             "ranks": given["ranks"],
             "path": given["path"],
+            "jacobians": given["jacobians"],
         },
         "training": {"seconds": given["seconds"]},
     }

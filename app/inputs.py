@@ -12,6 +12,7 @@ from softtwin.meshes.attachment import parse_file
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_body
 from softtwin.reference.data.dataset import DataSet, DataSetError, differences, existing
+from softtwin.reference.data.jacobians import mark
 from softtwin.reference.data.samplers import LoadPlan
 
 from .config import Config, ConfigError
@@ -66,6 +67,7 @@ def train_inputs(space: Workspace, data: DataSet) -> dict[str, Any]:
     """Entries of [training], the body's file and the identity of the data set."""
     every = _flat("training", space.config.training.model_dump())
     training = {name: value for name, value in every if _LATER.get(name, ...) != value}
+    training |= {"jacobians": mark(data)} if mark(data) else {}
     return {"body.vtu": _sha256(space.body), "data set": data.identity, **training}
 
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
-import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
@@ -19,7 +16,6 @@ import mpi4py
 import numpy as np
 import scipy
 import zarr
-from mpi4py.futures import MPICommExecutor
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
@@ -43,9 +39,10 @@ from .data.materials import MATERIALS, Material
 from .data.outcome import Equilibrium, NotConverged
 from .data.samplers import LoadPlan, check_loads, draw_load, loaded_nodes
 from .data.schema import Reason
+from .farm import quiet, share_out
 from .fem.fenicsx import MPI, PETSc, dolfinx
 from .modes import eigenmodes
-from .ranks import on_first, tell_all
+from .ranks import on_first
 from .solve.problem import NewtonOptions, Problem
 
 Floats = NDArray[np.float64]
@@ -148,35 +145,21 @@ def generate(
 
         def prepare() -> tuple[Path, list[int]]:
             assert path is not None and body is not None and plan is not None, "rank 0 gives all three"
-            held.enter_context(_locked(Path(path)))
+            held.enter_context(writing(Path(path)))
             return Path(path), _prepare(Path(path), body, plan, redo, again)
 
         folder, blocks = on_first(comm, prepare) or (None, [])
-        _solve(comm.bcast(folder, root=0), blocks, comm)
+        share_out(solve_block, str(comm.bcast(folder, root=0)), blocks, comm, "solving")
     return DataSet(folder) if folder is not None else None
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def writing(path: Path) -> Iterator[None]:
     """Keep others from writing the same data set; the system lets go of the lock when the process ends in any way."""
     path.parent.mkdir(parents=True, exist_ok=True)
     refusal = f"generate.path: another `generate` is at work in {path}; wait for it, end it, or choose another folder."
     with locked(path.with_name(f".{path.name}.lock"), DataSetError(refusal), _PATIENCE_S):
         yield
-
-
-def _solve(path: Path, blocks: list[int], comm: Any) -> None:
-    if comm.size == 1:
-        _solve_here(path, blocks)
-        return
-    failure: BaseException | None = None
-    with MPICommExecutor(comm, root=0) as pool:
-        if pool is not None:
-            try:
-                _farm(pool, path, blocks, workers=comm.size - 1)
-            except BaseException as error:  # whatever it is, the others wait for word of it
-                failure = error
-    tell_all(comm, failure)
 
 
 def _prepare(path: Path, body: Body, plan: Plan, redo: Sequence[int], again: bool) -> list[int]:
@@ -284,7 +267,7 @@ def linear_response(problem: Problem, loaded: NDArray[np.int64], seed: int = 0) 
 def _calibrate(problem: Problem, response: LinearResponse, shapes: Floats, plan: Plan) -> float:
     """The linear displacement at which half of the pilot loads have moved the body by the wanted one, metres."""
     found = []
-    for i in tqdm(range(_PILOTS), desc="calibrating the loads", unit="load", disable=_quiet()):
+    for i in tqdm(range(_PILOTS), desc="calibrating the loads", unit="load", disable=quiet()):
         load = draw_load(problem.body, shapes, plan.loads, np.random.default_rng([plan.seed, 1, i]))
         found.append(_reach(problem, load / _peak(response.apply(load[None, response.loaded])[0]), plan))
     amplitude = float(np.median(found))
@@ -325,47 +308,18 @@ def _peak(displacement: Floats) -> float:
 # ------------------------------------------------------------------ the farm
 
 
-def _solve_here(path: Path, blocks: list[int]) -> None:
-    for block in tqdm(blocks, desc="solving", unit="block", disable=_quiet()):
-        solve_block(str(path), block)
+def opened(path: str) -> tuple[DataSet, Plan, Problem]:
+    """What a block needs; kept for the next one.
 
-
-def _farm(pool: Any, path: Path, blocks: list[int], workers: int) -> None:
-    """Keep two blocks with every worker, and solve one here whenever they are all busy."""
-    waiting = iter(blocks)
-    busy: set[Future[int]] = set()
-    with tqdm(total=len(blocks), desc="solving", unit="block", disable=_quiet()) as bar:
-        while True:
-            for block in _take(waiting, 2 * workers - len(busy)):
-                busy.add(pool.submit(solve_block, str(path), block))
-            own = next(waiting, None)
-            if own is not None:
-                solve_block(str(path), own)
-                bar.update()
-            done, busy = wait(busy, timeout=0 if own is not None else None, return_when=FIRST_COMPLETED)
-            for future in done:
-                future.result()
-                bar.update()
-            if own is None and not busy:
-                return
-
-
-def _quiet() -> bool:
-    """No bar where nobody looks; mpirun hides the terminal, so whoever started it may ask for the bar."""
-    return not (sys.stderr.isatty() or os.environ.get("SOFTTWIN_PROGRESS") == "1")
-
-
-def _take(source: Iterator[int], count: int) -> Iterator[int]:
-    for _ in range(count):
-        item = next(source, None)
-        if item is None:
-            return
-        yield item
+    Args:
+        path: folder of the data set.
+    """
+    return _opened(path, (Path(path) / "zarr.json").stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=1)
 def _opened(path: str, made: int) -> tuple[DataSet, Plan, Problem]:
-    """What a block needs; `made`, the time of the header, tells a data set that was made again in the same place."""
+    """`made`, the time of the header, tells a data set that was made again in the same place."""
     data = DataSet(path)
     plan = plan_from_header(data.header)
     return data, plan, Problem(data.body, plan.build_material(), plan.newton)
@@ -378,7 +332,7 @@ def solve_block(path: str, block: int) -> int:
         path: folder of the data set.
         block: number of the block.
     """
-    data, plan, problem = _opened(path, (Path(path) / "zarr.json").stat().st_mtime_ns)
+    data, plan, problem = opened(path)
     with threadpool_limits(1):
         paths = range(block * plan.block // plan.path, (block + 1) * plan.block // plan.path)
         rows = [row for number in paths for row in _solve_path(data, plan, problem, number)]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from softtwin.reference.data.dataset import DataSet, Samples
+from softtwin.reference.data.jacobians import mark
 
 from .plan import TrainingPlan
 
@@ -22,13 +23,14 @@ class CheckpointError(ValueError):
 
 
 def fingerprint(data: DataSet, splits: Mapping[str, Samples]) -> str:
-    """SHA-256 of all that training reads: body, linear response, training and validation samples."""
+    """SHA-256 of all that training reads: body, linear response, training and validation samples, Jacobians."""
     digest = hashlib.sha256(data.body.fingerprint.encode())
     arrays = [data.response.loaded, data.response.left, data.response.right, data.shapes]
     for samples in splits.values():
         arrays += [samples.draws, samples.forces, samples.displacements, samples.probes, samples.adjoints]
     for array in arrays:
         digest.update(np.ascontiguousarray(array).data)
+    digest.update(mark(data).encode())
     return digest.hexdigest()
 
 

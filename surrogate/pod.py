@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from softtwin.meshes.body import Body
+from softtwin.reference.data.dataset import DataSet, Samples
 
-from .symmetry import Symmetry
+from .symmetry import Symmetry, identity, symmetries
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+_FLOOR = 0.01  # keeps the semi-relative error finite for loads near zero
 _DENSE = 3000  # largest eigenproblem of the POD solved directly
 
 
@@ -98,9 +100,62 @@ class ReducedBasis:
         return np.concatenate([coordinates @ turn.T for turn in self.turns])
 
 
+def sizes_of(fields: Floats) -> Floats:
+    """Euclidean norm of each field, (s,), for fields (s, n, 3)."""
+    return np.linalg.norm(fields.reshape(len(fields), -1), axis=1)
+
+
+def semi_relative(displacements: Floats, rms: float) -> Floats:
+    """What squared errors of samples are divided by, (s,): |u| rms + 0.01 rms^2, finite for loads near zero.
+
+    Args:
+        displacements: (s, n, 3), metres.
+        rms: root mean square of |u| over the training samples, metres.
+    """
+    return sizes_of(displacements) * rms + _FLOOR * rms**2
+
+
+def learned_basis(data: DataSet, train: Samples, count: int, symmetric: bool) -> ReducedBasis:
+    """The basis of what the linear response misses of training samples, the larger ones not all that counts.
+
+    Args:
+        data: for its body and linear response.
+        train: the samples.
+        count: most modes wanted.
+        symmetric: whether the body's symmetries are used.
+
+    Raises:
+        ValueError: no samples that differ from the linear response.
+    """
+    rms = float(np.sqrt(np.mean(sizes_of(train.displacements) ** 2)))
+    weights = 1.0 / np.sqrt(semi_relative(train.displacements, rms))
+    corrections = train.displacements - data.response.apply(train.forces)
+    weighted = corrections * weights[:, None, None]
+    return build_basis(weighted, data.body, data.response.loaded, group_of(data, symmetric), count)
+
+
+def basis_of(data: DataSet, modes: Floats, symmetric: bool) -> ReducedBasis:
+    """The basis of modes that are known, which span an invariant space where symmetries are used.
+
+    Args:
+        data: for its body and loaded nodes.
+        modes: V, orthonormal, (3n, r).
+        symmetric: whether the body's symmetries are used.
+    """
+    return ReducedBasis(modes, data.response.loaded, _turns(modes, data.body, group_of(data, symmetric)))
+
+
+def group_of(data: DataSet, symmetric: bool) -> tuple[Symmetry, ...]:
+    """The symmetries of a data set's body, or the identity alone."""
+    return symmetries(data.body, data.response.loaded) if symmetric else (identity(data.body),)
+
+
+def _turns(modes: Floats, body: Body, group: Sequence[Symmetry]) -> Floats:
+    fields = modes.T.reshape(-1, *body.points.shape)
+    return np.stack([modes.T @ motion.apply(fields).reshape(len(fields), -1).T for motion in group])
+
+
 def build_basis(corrections: Floats, body: Body, loaded: Ints, group: Sequence[Symmetry], count: int) -> ReducedBasis:
     """The reduced basis of weighted corrections (s, n, 3): see `correction_modes`."""
     modes = correction_modes(corrections, body.fixed, group, count)
-    fields = modes.T.reshape(-1, *body.points.shape)
-    turns = np.stack([modes.T @ motion.apply(fields).reshape(len(fields), -1).T for motion in group])
-    return ReducedBasis(modes, loaded, turns)
+    return ReducedBasis(modes, loaded, _turns(modes, body, group))

@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from softtwin.reference.data.dataset import DataSet, LinearResponse, Samples, probe_cotangents
+from softtwin.reference.data.jacobians import Jacobians, read_jacobians
 
 from .architecture import Network
 from .maps import LinearMaps, response_parts
-from .pod import build_basis
-from .symmetry import identity, symmetries
+from .pod import ReducedBasis, basis_of, learned_basis, semi_relative, sizes_of
 
 Floats = NDArray[np.float64]
 
 _GATE = 0.1  # size of the scaled input, relative to its usual one, below which the correction fades quadratically
 _ROOT_HALF, _DENSITY = 0.5**0.5, float((2.0 * np.pi) ** -0.5)  # of the normal law in the GELU
 _TINY = 1e-30  # a number in single precision, too
-_FLOOR = 0.01  # keeps the semi-relative loss finite for loads near zero
+_DIRECTIONS = 8192  # that Jacobians are looked at in
 _SHARE = 4  # one sample in so many enters the gradient's loss: it costs three times the other and needs fewer
 
 
@@ -41,7 +41,9 @@ class Reduced:
         modes: POD modes at most.
         width: width of its blocks.
         depth: number of its blocks.
-        sobolev: weight of the gradient's error in the loss; 0 leaves it out, as data without gradients do.
+        sobolev: weight of the derivative's error in the loss: of whole reduced Jacobians where the data set has them,
+            in a fresh direction a sample and step, else of the one gradient that is stored with each sample; 0 leaves
+            it out, as data without gradients do.
         symmetries: use the body's symmetries, if it has any: learn from symmetric images too, and average over them
             when predicting.
 
@@ -230,7 +232,8 @@ class ReducedLesson(nn.Module):
     """The reduced network with its training data in reduced coordinates; loss and validation error are methods.
 
     The loss is |u - u*|^2 / (|u*| rms + 0.01 rms^2), without the part outside the modes, plus `sobolev` times the
-    squared relative error of the gradient J^T g against the stored adjoints.
+    squared relative error of the gradient J^T g against the stored adjoints, or of J^T V z with z of unit variance
+    against the data set's Jacobians, which makes it in the mean that of J^T V in the Frobenius norm.
 
     Args:
         data: the data set, for its body, modes and linear response.
@@ -239,7 +242,8 @@ class ReducedLesson(nn.Module):
         settings: of the network.
 
     Raises:
-        ValueError: no training samples, or none that differ from the linear response.
+        DataSetError: the data set's Jacobians are damaged or not finished.
+        ValueError: no training samples, or none that differ from the linear response; Jacobians of other modes.
     """
 
     forces: Tensor
@@ -253,6 +257,8 @@ class ReducedLesson(nn.Module):
     cotangents: Tensor
     adjoints: Tensor
     adjoint_weights: Tensor
+    jacobians: Tensor
+    directions: Tensor
     metric: Tensor
     validation_forces: Tensor
     validation_loads: Tensor
@@ -264,13 +270,17 @@ class ReducedLesson(nn.Module):
         super().__init__()
         self.response = data.response
         self.sobolev = settings.sobolev if data.has_gradients else 0.0
-        loaded = data.response.loaded
-        group = symmetries(data.body, loaded) if settings.symmetries else (identity(data.body),)
-        self._rms = float(np.sqrt(np.mean(_sizes(train.displacements) ** 2)))
-        corrections = _corrections(data.response, train)
-        weights = 1.0 / np.sqrt(self._scale(train))
-        self.basis = build_basis(corrections * weights[:, None, None], data.body, loaded, group, settings.modes)
-        self._store_training(data, train, corrections)
+        self._rms = float(np.sqrt(np.mean(sizes_of(train.displacements) ** 2)))
+        stored = read_jacobians(data, train.draws) if self.sobolev > 0.0 else None
+        if stored is None:
+            self.basis = learned_basis(data, train, settings.modes, settings.symmetries)
+        else:
+            self.basis = _basis_of(stored, data, settings)
+        self._store_training(data, train, _corrections(data.response, train))
+        if stored is not None:
+            self._store_jacobians(stored)
+        elif self.sobolev > 0.0:
+            self._store_adjoints(data, train)
         self._store_validation(validation, _corrections(data.response, validation))
         self._build(train, settings)
 
@@ -283,7 +293,15 @@ class ReducedLesson(nn.Module):
         """Loss over the samples with the given numbers; the gradient's error over the first quarter of them."""
         missed = (self.network(self.loads[batch]) - self.targets[batch]).square().sum(dim=1)
         loss = (missed * self.weights[batch]).mean()
-        return loss + self.sobolev * self._gradient_loss(batch[: -(-len(batch) // _SHARE)]) if self.sobolev else loss
+        if not self.sobolev:
+            return loss
+        few = batch[: -(-len(batch) // _SHARE)]
+        return loss + self.sobolev * (self._jacobian_loss(few) if self.whole else self._gradient_loss(few))
+
+    @property
+    def whole(self) -> bool:
+        """Whether whole Jacobians are learned from."""
+        return hasattr(self, "jacobians")
 
     @property
     def validation_count(self) -> int:
@@ -308,6 +326,17 @@ class ReducedLesson(nn.Module):
         loads = self.loads[batch].requires_grad_()
         (pulled,) = torch.autograd.grad(self.network(loads), loads, self.cotangents[batch], create_graph=True)
         missed = (pulled @ self.metric.T - self.adjoints[batch]).square().sum(dim=1)
+        return (missed * self.adjoint_weights[batch]).mean()
+
+    def _jacobian_loss(self, batch: Tensor) -> Tensor:
+        count, loads = len(self.jacobians), self.loads[batch].requires_grad_()
+        turns = self.turns[batch // count]
+        # A sample meets other directions in other company: a function of the batch, so that training can go on.
+        along = self.directions[(batch + batch.sum()) % len(self.directions)]
+        (pulled,) = torch.autograd.grad(self.network(loads), loads, along, create_graph=True)
+        in_sample = torch.einsum("sij,si->sj", turns, along)
+        wanted = torch.einsum("sij,sjk,sk->si", turns, self.jacobians[batch % count], in_sample)
+        missed = (pulled @ self.metric.T - wanted).square().sum(dim=1)
         return (missed * self.adjoint_weights[batch]).mean()
 
     @torch.no_grad()
@@ -338,7 +367,7 @@ class ReducedLesson(nn.Module):
         self.network = ReducedNetwork(_tensor(scale), size, settings.width, settings.depth)
 
     def _scale(self, samples: Samples) -> Floats:
-        return _sizes(samples.displacements) * self._rms + _FLOOR * self._rms**2
+        return semi_relative(samples.displacements, self._rms)
 
     def _store_training(self, data: DataSet, train: Samples, corrections: Floats) -> None:
         basis, group = self.basis, len(self.basis.turns)
@@ -349,8 +378,23 @@ class ReducedLesson(nn.Module):
         named = {"turns": basis.turns, "modes": basis.modes, "left": self.response.left, "right": self.response.right}
         for name, values in named.items():
             self._store(name, values)
-        if self.sobolev > 0.0:
-            self._store_adjoints(data, train)
+
+    def _root(self) -> tuple[Floats, Floats]:
+        """(P^T P)^(1/2) of the modes P at the loaded nodes, which commutes with the symmetries, and its inverse."""
+        restricted = self.basis.restricted
+        values, vectors = np.linalg.eigh(restricted.T @ restricted)
+        values = np.sqrt(np.maximum(values, 1e-12 * values.max()))
+        return (vectors * values) @ vectors.T, (vectors / values) @ vectors.T
+
+    def _store_jacobians(self, stored: Jacobians) -> None:
+        """|P K^-1 V z - LR^T V z - P y|^2 as for gradients, z from many that are drawn once."""
+        basis, (root, inverse) = self.basis, self._root()
+        left, right = self.response.left, self.response.right
+        at_rest = basis.restricted.T @ right.T @ (left.T @ basis.modes)
+        self._store("metric", root)
+        self._store("jacobians", np.einsum("ij,sjk->sik", inverse.astype(np.float32), stored.values - at_rest))
+        self._store("adjoint_weights", np.tile(1.0 / stored.squares, len(basis.turns)))
+        self._store("directions", np.random.default_rng(0).standard_normal((_DIRECTIONS, basis.count)))
 
     def _store_adjoints(self, data: DataSet, train: Samples) -> None:
         """|h - LR^T g - P y|^2 = |R y - Q^T (h - LR^T g)|^2 + const for P = Q R: r numbers a sample instead of 3l."""
@@ -358,11 +402,9 @@ class ReducedLesson(nn.Module):
         cotangents = probe_cotangents(data.body, data.shapes, train.probes).reshape(len(train), -1)
         adjoints = train.adjoints.reshape(len(train), -1)
         missing = (adjoints - cotangents @ data.response.left @ data.response.right) @ basis.restricted
-        # In coordinates P^T d and the metric (P^T P)^(1/2), which commute with the symmetries, unlike Q and R.
-        values, vectors = np.linalg.eigh(basis.restricted.T @ basis.restricted)
-        values = np.maximum(values, 1e-12 * values.max())
-        self._store("metric", (vectors * np.sqrt(values)) @ vectors.T)
-        self._store("adjoints", basis.images(missing @ (vectors / np.sqrt(values)) @ vectors.T))
+        root, inverse = self._root()  # in place of Q and R, which do not commute with the symmetries
+        self._store("metric", root)
+        self._store("adjoints", basis.images(missing @ inverse))
         self._store("cotangents", basis.images(cotangents @ basis.modes))
         sizes = np.maximum((adjoints**2).sum(axis=1), 1e-300)
         self._store("adjoint_weights", np.tile(1.0 / sizes, group))
@@ -384,8 +426,13 @@ def _corrections(response: LinearResponse, samples: Samples) -> Floats:
     return samples.displacements - response.apply(samples.forces)
 
 
-def _sizes(fields: Floats) -> Floats:
-    return np.linalg.norm(fields.reshape(len(fields), -1), axis=1)
+def _basis_of(stored: Jacobians, data: DataSet, settings: Reduced) -> ReducedBasis:
+    if stored.modes.shape[1] > settings.modes:
+        raise ValueError(
+            f"Reduced.modes: expected at least the {stored.modes.shape[1]} that the Jacobians in {data.path} are of, "
+            f"got {settings.modes}; make the Jacobians again, or leave them out with sobolev = 0."
+        )
+    return basis_of(data, stored.modes, settings.symmetries)
 
 
 def _deviation(coordinates: Floats) -> Floats:

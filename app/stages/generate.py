@@ -6,16 +6,26 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.jacobians import missing_jacobians, stored_modes
 from softtwin.reference.ranks import on_first
+from softtwin.surrogate.pod import learned_basis
 
+from ..config import Config
 from ..inputs import current_body, generate_inputs, plan_entries
 from ..workspace import Workspace, open_workspace, record_stage
 
+Floats = NDArray[np.float64]
+
 
 def generate_stage(configuration: Path, redo: Sequence[int] = (), again: bool = False) -> DataSet | None:
-    """Solve the equilibria of the data set; collective where mpirun started it. Returns None on ranks other than 0.
+    """Solve the equilibria of the data set, and their Jacobians where these are wanted.
+
+    Collective where mpirun started it; returns None on ranks other than 0.
 
     Args:
         configuration: the configuration file, read on rank 0 alone.
@@ -27,27 +37,55 @@ def generate_stage(configuration: Path, redo: Sequence[int] = (), again: bool = 
         DataSetError: the folder holds a data set of another configuration, or somebody else writes it.
         FailedElsewhere: on the other ranks, where rank 0 raises one of these.
     """
+    from softtwin.reference.differentiate import differentiate
     from softtwin.reference.fem.fenicsx import MPI  # FEniCSx is needed by this stage alone
     from softtwin.reference.generate import generate, plan_from_header
 
     comm, begin = MPI.COMM_WORLD, time.perf_counter()
     asked = on_first(comm, lambda: _read(configuration))
     if asked is None:
-        return generate(None, None, None, comm)
+        generate(None, None, None, comm)
+        if comm.bcast(None, root=0):
+            on_first(comm, lambda: None)
+            differentiate(None, None, comm)
+        return None
     space, body = asked
     plan = plan_from_header({"plan": plan_entries(space.config)})
     data = generate(space.data, body, plan, comm, redo, again)
+    assert data is not None
+    if comm.bcast(space.config.samples.jacobians, root=0):
+        modes = on_first(comm, lambda: jacobian_modes(space.config, data))
+        differentiate(space.data, modes, comm)
     record_stage(space, "generate", time.perf_counter() - begin, generate_inputs(space, body))
     return data
 
 
+def jacobian_modes(config: Config, data: DataSet) -> Floats:
+    """The modes that the reduced network of a configuration has on a data set, (3n, r)."""
+    settings = config.training.settings
+    symmetric = bool(settings.get("symmetries", True))
+    return learned_basis(data, data.samples("train"), config.training.modes, symmetric).modes
+
+
+def lacks_jacobians(config: Config, data: DataSet) -> bool:
+    """Whether Jacobians are wanted that are not there, or not all, or of other modes."""
+    if not config.samples.jacobians:
+        return False
+    modes = stored_modes(data)
+    if modes is None or missing_jacobians(data):
+        return True
+    return not np.array_equal(modes, jacobian_modes(config, data))
+
+
 def describe_data(data: DataSet) -> str:
-    """Counts of accepted and rejected draws, with the reasons of the rejected."""
+    """Counts of accepted and rejected draws, with the reasons of the rejected; what Jacobians there are."""
     rejected = data.rejected()
     counts = {reason: rejected.reasons.count(reason) for reason in sorted(set(rejected.reasons))}
     total = sum(data.header["samples"].values())
     because = f" ({', '.join(f'{count} {reason}' for reason, count in counts.items())})" if counts else ""
-    return f"{total - len(rejected.draws)} equilibria accepted, {len(rejected.draws)} rejected{because}"
+    modes = stored_modes(data)
+    jacobians = "" if modes is None else f", Jacobians of {modes.shape[1]} modes"
+    return f"{total - len(rejected.draws)} equilibria accepted, {len(rejected.draws)} rejected{because}{jacobians}"
 
 
 def _read(configuration: Path) -> tuple[Workspace, Body]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -219,6 +219,21 @@ class DataSet:
             draws=np.arange(draws.start, draws.stop)[kept],
             **{name: group[name][part][kept] for name in schema.FIELDS},
         )
+
+    def accepted(self, draws: Ints) -> Iterator[tuple[int, Floats]]:
+        """Numbers and displacements, (n, 3), metres, of those of some draws that were accepted."""
+        group = self._root["samples"]
+        for draw in draws:
+            if group["reason"][int(draw)] == 0:
+                yield int(draw), group["displacements"][int(draw)]
+
+    def check_complete(self, split: Split) -> None:
+        """Refuse a split of which something is missing or damaged.
+
+        Raises:
+            DataSetError: it is so.
+        """
+        self._check_blocks(self.split_draws(split))
 
     def rejected(self) -> Rejected:
         """All draws of all splits that were kept apart."""

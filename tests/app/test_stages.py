@@ -29,6 +29,7 @@ from softtwin.meshes.embedding import outer
 from softtwin.meshes.files import read_body, write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.jacobians import stored_modes
 
 ENTRIES = {
     "folder": ".",
@@ -391,3 +392,21 @@ def test_a_twin_on_a_regular_grid_registers_clouds_of_the_surface(capsys, tmp_pa
     run(capsys, "train", out / "organ.toml", "--fresh")
     assert "umesh" in (out / "twin" / "surrogate.json").read_text()
     run(capsys, "validate", out / "organ.toml")
+
+
+def test_jacobians_are_made_where_they_are_wanted(copy: Path) -> None:
+    wanted = {"samples": {"jacobians": True}}
+    weights = (copy / "twin" / "surrogate.safetensors").read_bytes()
+    said = build(copy, **wanted)
+    assert "there already" not in said and "from the start" in said
+    modes = stored_modes(DataSet(copy / "data.zarr"))
+    assert modes is not None and modes.shape[1] == 4
+    assert (copy / "twin" / "surrogate.safetensors").read_bytes() != weights
+    assert "there already: 10 equilibria accepted, 0 rejected, Jacobians of 4 modes" in build(copy, **wanted)
+    build(copy, **wanted, training={"modes": 3})
+    assert stored_modes(DataSet(copy / "data.zarr")).shape[1] == 3
+
+
+def test_jacobians_for_a_network_that_reads_none_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"samples\.jacobians: expected the architecture reduced"):
+        config(samples={"jacobians": True}, training={"architecture": "mlp", "modes": 64, "width": 256})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +12,16 @@ import torch
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.jacobians import prepare_jacobians, stored_modes, write_jacobians
 from softtwin.surrogate import reduced as reduced_module
 from softtwin.surrogate.model import Surrogate
-from softtwin.surrogate.pod import correction_modes
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.pod import correction_modes, learned_basis
 from softtwin.surrogate.reduced import Reduced, ReducedLesson
 from softtwin.surrogate.symmetry import identity, symmetries
+from softtwin.surrogate.train import train
+
+from .conftest import ClosedForm
 
 
 def _loaded(body: Body) -> np.ndarray:
@@ -153,3 +159,84 @@ def test_prediction_turns_with_the_load(reduced: Surrogate, forces: np.ndarray) 
     for motion in group:
         found = reduced.solve(motion.apply(forces[None])[0]).displacement
         assert np.abs(found - motion.apply(expected[None])[0]).max() < 1e-9 * np.abs(expected).max()
+
+
+@pytest.fixture
+def differentiated(make_data: Any) -> DataSet:
+    """The closed form's data with its Jacobians in six modes."""
+    data = make_data()
+    train = data.samples("train")
+    modes = learned_basis(data, train, 6, True).modes
+    prepare_jacobians(data, modes)
+    loaded, truth = data.response.loaded, ClosedForm(data.body)
+    rows, size = (3 * loaded[:, None] + np.arange(3)).ravel(), data.header["block"]
+    values = np.zeros((data.block_count * size, modes.shape[1], modes.shape[1]))
+    squares = np.zeros(len(values))
+    for draw, given in zip(train.draws, train.forces, strict=True):
+        forces = np.zeros_like(data.body.points)
+        forces[loaded] = given
+        columns = np.stack([truth.adjoint(forces, mode.reshape(-1, 3)).ravel() for mode in modes.T], axis=1)[rows]
+        values[draw], squares[draw] = modes[rows].T @ columns, np.square(columns).sum()
+    for block in range(len(data.split_draws("train")) // size):
+        part = slice(block * size, (block + 1) * size)
+        write_jacobians(data.path, block, values[part], squares[part])
+    return DataSet(data.path)
+
+
+def test_the_loss_of_jacobians_is_their_frobenius_error(differentiated: DataSet) -> None:
+    """Over all directions of a basis in place of random ones, for samples and their images."""
+    lesson = _lesson(differentiated)
+    modes, rows = lesson.basis.modes, lesson.basis.restricted
+    count = len(differentiated.samples("train"))
+    assert lesson.whole and lesson.basis.count == 6 and lesson.sample_count == 8 * count
+    batch = torch.tensor([3, count + 3, 5 * count + 7])
+    found = 0.0
+    for shift in range(6):
+        lesson.directions = torch.roll(torch.eye(6), shift, 0)
+        found += float(lesson._jacobian_loss(batch).detach())
+    train, truth = differentiated.samples("train"), ClosedForm(differentiated.body)
+    group, expected = symmetries(differentiated.body, differentiated.response.loaded), 0.0
+    for number in batch.tolist():
+        motion, forces = group[number // count], np.zeros((1, *differentiated.body.points.shape))
+        forces[0, differentiated.response.loaded] = train.forces[number % count]
+        load = motion.apply(forces)[0]
+        columns = np.stack([truth.adjoint(load, mode.reshape(-1, 3)).ravel() for mode in modes.T], axis=1)
+        at = (3 * differentiated.response.loaded[:, None] + np.arange(3)).ravel()
+        missing = columns[at] - (lesson.response.left @ lesson.response.right).T @ modes
+        single = lesson.network.double()
+        coordinates = torch.from_numpy(rows.T @ load.ravel()[at])[None]
+        jacobian = torch.func.jacrev(lambda x, net=single: net(x)[0])(coordinates)[:, 0].detach().numpy()
+        part = missing - rows @ np.linalg.lstsq(rows, missing, rcond=None)[0]  # what no network between these can have
+        error = np.square(missing - rows @ jacobian.T).sum() - np.square(part).sum()
+        expected += error / np.square(columns[at]).sum()
+    assert found == pytest.approx(expected / 3, rel=1e-3)
+
+
+def test_jacobians_are_learned_from(differentiated: DataSet, data: DataSet) -> None:
+    """In the coordinates of the modes, in all directions, on samples that were not learned from."""
+    plans = [TrainingPlan(Reduced(6, 32, 2, weight), samples=12, epochs=1000) for weight in (0.0, 0.3)]
+    truth, loaded, test = ClosedForm(data.body), data.response.loaded, data.samples("test")
+    modes = stored_modes(differentiated)
+    columns = np.zeros_like(modes)
+    rows = (3 * loaded[:, None] + np.arange(3)).ravel()
+    columns[rows] = modes[rows]
+
+    def error(surrogate: Surrogate) -> float:
+        found = []
+        for given in test.forces:
+            forces = np.zeros_like(data.body.points)
+            forces[loaded] = given
+            exact = np.stack([truth.adjoint(forces, m.reshape(-1, 3)).ravel() for m in modes.T]) @ columns
+            missed = modes.T @ surrogate.solve(forces).push(columns) - exact
+            found.append(np.linalg.norm(missed) / np.linalg.norm(exact))
+        return float(np.median(found))
+
+    without, with_jacobians = (train(differentiated, plan) for plan in plans)
+    assert error(with_jacobians) < 0.6 * error(without)
+
+
+def test_fewer_modes_than_the_jacobians_are_of_are_refused(differentiated: DataSet) -> None:
+    samples = differentiated.samples("train")
+    with pytest.raises(ValueError, match=r"Reduced\.modes: expected at least the 6 .* got 4"):
+        Reduced(modes=4).lesson(differentiated, samples, samples)
+    assert not Reduced(modes=4, sobolev=0.0).lesson(differentiated, samples, samples).whole
