@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -27,6 +28,7 @@ from softtwin.app.config import Config
 from softtwin.app.launch import generate_in_parallel
 from softtwin.app.stages.mesh import mesh_stage
 from softtwin.reference.data.dataset import DataSet, Samples, existing
+from softtwin.reference.data.jacobians import missing_jacobians
 from softtwin.reference.generate import plan_from_header
 from softtwin.reference.solve.problem import Problem
 from softtwin.surrogate.architecture import Architecture, Network
@@ -54,14 +56,17 @@ CHANNELS, FEW = 16, 2048  # of U-Mesh, and its samples, on two cores; the thesis
 EPOCHS = 100  # of the thesis
 
 
-def data_of(kind: str, counts: dict[str, int], ranks: int) -> DataSet:
-    """The beam under modal or random loads; what is there is not made again."""
-    folder = RUNS / f"beam-{kind}-{counts['train']}"
+def data_of(kind: str, counts: dict[str, int], ranks: int, jacobians: bool = False) -> DataSet:
+    """The beam under modal or random loads, with Jacobians in a folder of its own; what is there is not made again."""
+    plain = RUNS / f"beam-{kind}-{counts['train']}"
+    folder = plain.with_name(f"{plain.name}-jacobians") if jacobians else plain
     loads = {"kind": kind, "amplitude": AMPLITUDES[kind], "patches": 1, "radius": (0.055, 0.64)}
-    samples = {**counts, "block": 16, "ranks": ranks}
+    samples = {**counts, "block": 16, "ranks": ranks, "jacobians": jacobians}
     made = existing(folder / "data.zarr")
-    if made is not None and not made.missing_blocks():
+    if made is not None and not made.missing_blocks() and not (jacobians and missing_jacobians(made)):
         return made
+    if jacobians and made is None and (plain / "data.zarr").exists():
+        shutil.copytree(plain / "data.zarr", folder / "data.zarr")
     config = Config.model_validate({"folder": ".", "body": {"source": "beam"}, "loads": loads, "samples": samples})
     space = prepare(config, folder)
     mesh_stage(space)
@@ -78,12 +83,14 @@ class Row:
         label: what stands in the first column.
         plan: what is trained; None for the baseline without training, a linear map between POD coordinates.
         kind: distribution that it learns from.
+        jacobians: whether it learns from whole Jacobians, too.
     """
 
     table: str
     label: str
     plan: TrainingPlan | None
     kind: str = "modal"
+    jacobians: bool = False
 
     @property
     def key(self) -> str:
@@ -107,6 +114,11 @@ def rows(tables: list[str], train_count: int, seconds: float) -> Iterator[Row]:
         for name, (architecture, seeds) in kinds.items():
             for seed in range(seeds):
                 yield Row("4.2", f"{name}, seed {seed}", TrainingPlan(architecture, seconds=seconds, seed=seed))
+        for seed in range(3):
+            plan = TrainingPlan(Reduced(), seconds=seconds, seed=seed)
+            yield Row("4.2", f"reduced, whole Jacobians, seed {seed}", plan, jacobians=True)
+        plan = TrainingPlan(Reduced(), seconds=6.0 * seconds)
+        yield Row("4.2", "reduced, whole Jacobians, six times as long", plan, jacobians=True)
         for name in ("reduced", "mlp"):
             yield Row("4.2", f"{name}, {EPOCHS} epochs", TrainingPlan(kinds[name][0], epochs=EPOCHS))
         slow = TrainingPlan(Reduced(), seconds=seconds, learning_rate=1e-3)
@@ -187,10 +199,10 @@ def judged(
     return found
 
 
-def run(row: Row, data: dict[str, DataSet], problem: Problem) -> dict[str, Any]:
-    """Train and judge one row."""
+def run(row: Row, data: dict[str, DataSet], problem: Problem, learned: DataSet | None = None) -> dict[str, Any]:
+    """Train, on other data than are judged where these are given, and judge one row."""
     began = time.perf_counter()
-    own = data[row.kind]
+    own = learned or data[row.kind]
     surrogate = linear_map(own) if row.plan is None else train(own, row.plan)
     seconds = time.perf_counter() - began
     figures: dict[str, Any] = {"plan": None if row.plan is None else row.plan.entries(), "learned_from": row.kind}
@@ -244,7 +256,9 @@ def main() -> None:
             if arguments.only not in row.key:
                 continue
             if row.key not in found:
-                found[row.key] = run(row, data, problem)
+                counts = {"train": arguments.train, **held_out}
+                learned = data_of("modal", counts, arguments.ranks, True) if row.jacobians else None
+                found[row.key] = run(row, data, problem, learned)
                 write(path.stem, found)
             show(row.key, found[row.key])
 
