@@ -66,7 +66,7 @@ def data_of(kind: str, counts: dict[str, int], ranks: int, jacobians: bool = Fal
     if made is not None and not made.missing_blocks() and not (jacobians and missing_jacobians(made)):
         return made
     if jacobians and made is None and (plain / "data.zarr").exists():
-        shutil.copytree(plain / "data.zarr", folder / "data.zarr")
+        shutil.copytree(plain, folder)
     config = Config.model_validate({"folder": ".", "body": {"source": "beam"}, "loads": loads, "samples": samples})
     space = prepare(config, folder)
     mesh_stage(space)
