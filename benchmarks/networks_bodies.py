@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from networks import RUNS, Row, run, show
+from numpy.typing import NDArray
 from record import LIVER, RESULTS, write
 
 from softtwin.meshes.body import Body
@@ -26,11 +28,16 @@ from softtwin.meshes.files import read_mesh
 from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam, propeller
 from softtwin.reference.data.dataset import DataSet, existing
+from softtwin.reference.data.jacobians import missing_jacobians
 from softtwin.reference.data.samplers import LoadPlan
+from softtwin.reference.differentiate import differentiate
+from softtwin.reference.fem.fenicsx import MPI
 from softtwin.reference.generate import Plan, generate
+from softtwin.reference.ranks import on_first
 from softtwin.reference.solve.problem import Problem
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.pod import learned_basis
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
@@ -49,12 +56,14 @@ class Case:
         body: makes it.
         plan: how its equilibria are made.
         channels: of U-Mesh on two cores, which the thesis has 128 of; 0 where the body is on no regular grid.
+        modes: of the larger of the reduced networks, which learns from whole Jacobians.
     """
 
     table: str
     body: Callable[[], Body]
     plan: Plan
     channels: int
+    modes: int
 
 
 def liver() -> Body:
@@ -68,29 +77,54 @@ def case(name: str) -> Case:
     """By name; displacements are chosen to the thesis's: |u|_2 of 0.657 +- 0.352 m (liver), 40 m (beam), 1 cm."""
     if name == "liver":
         loads = LoadPlan(patches=5, displacement=0.055)
-        return Case("4.3", liver, Plan("neo-hookean", 5000.0, 0.45, loads, {"train": 1024, **HELD_OUT}), 8)
+        return Case("4.3", liver, Plan("neo-hookean", 5000.0, 0.45, loads, {"train": 1024, **HELD_OUT}), 8, 192)
     if name == "beam":
         loads, samples = LoadPlan(displacement=40.0), {"train": 4095, **HELD_OUT}
         plan = Plan("saint-venant-kirchhoff", 4500.0, 0.3, loads, samples)
-        return Case("5.1", lambda: beam((39, 9, 9), (100.0, 25.0, 25.0)), plan, 8)
+        return Case("5.1", lambda: beam((39, 9, 9), (100.0, 25.0, 25.0)), plan, 8, 64)
     loads, samples = LoadPlan(displacement=0.02), {"train": 4095, **HELD_OUT}
     plan = Plan("neo-hookean", 2.03e11, 0.4, loads, samples)
-    return Case("5.1", lambda: propeller(PROPELLER_CELL), plan, 0)
+    return Case("5.1", lambda: propeller(PROPELLER_CELL), plan, 0, 192)
 
 
 PROPELLER_CELL = 0.016  # metres: 12,069 unknowns, where the thesis has 12,075
 
 
-def data_of(name: str, ranks: int) -> DataSet:
+def folder_of(name: str, jacobians: bool) -> Path:
+    """Where the equilibria of a case are, those with Jacobians in a copy of their own."""
+    return RUNS / f"bodies-{name}{'-jacobians' if jacobians else ''}"
+
+
+def data_of(name: str, ranks: int, jacobians: bool = False) -> DataSet:
     """The equilibria of a case; what is there is not made again."""
-    path = RUNS / f"bodies-{name}" / "data.zarr"
+    path = folder_of(name, jacobians) / "data.zarr"
     made = existing(path)
-    if made is None or made.missing_blocks():
-        command = [sys.executable, __file__, "--generate", name]
+    if made is None or made.missing_blocks() or (jacobians and missing_jacobians(made)):
+        if jacobians and made is None:
+            shutil.copytree(data_of(name, ranks).path, path)
+        command = [sys.executable, __file__, "--differentiate" if jacobians else "--generate", name]
         if ranks > 1:
             command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), *command]
         subprocess.run(command, check=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
     return DataSet(path)
+
+
+def make(name: str) -> None:
+    """Solve the equilibria; on all ranks where mpirun started this."""
+    path = folder_of(name, False) / "data.zarr"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    generate(path, case(name).body(), case(name).plan)
+
+
+def differentiate_all(name: str) -> None:
+    """Make the Jacobians; on all ranks where mpirun started this."""
+    path = folder_of(name, True) / "data.zarr"
+
+    def modes() -> NDArray[np.float64]:
+        data = DataSet(path)
+        return learned_basis(data, data.samples("train"), case(name).modes, True).modes
+
+    differentiate(path, on_first(MPI.COMM_WORLD, modes))
 
 
 def rows(name: str, seconds: float) -> Iterator[Row]:
@@ -102,6 +136,9 @@ def rows(name: str, seconds: float) -> Iterator[Row]:
     yield Row(chosen.table, f"{name}, POD, linear map", None, name)
     for label, architecture in kinds.items():
         yield Row(chosen.table, f"{name}, {label}", TrainingPlan(architecture, seconds=seconds), name)
+    larger = TrainingPlan(Reduced(modes=chosen.modes), seconds=seconds)
+    yield Row(chosen.table, f"{name}, reduced, {chosen.modes} modes", larger, name)
+    yield Row(chosen.table, f"{name}, reduced, {chosen.modes} modes, whole Jacobians", larger, name, jacobians=True)
 
 
 def main() -> None:
@@ -112,12 +149,10 @@ def main() -> None:
     parser.add_argument("--only", default="", help="rows that have this in their name")
     parser.add_argument("--name", default=NAME, help="of the record")
     parser.add_argument("--generate", default="", help="make the data of this body alone, and end")
+    parser.add_argument("--differentiate", default="", help="make their Jacobians alone, and end")
     arguments = parser.parse_args()
-    if arguments.generate:
-        chosen = case(arguments.generate)
-        path = RUNS / f"bodies-{arguments.generate}" / "data.zarr"
-        Path(path.parent).mkdir(parents=True, exist_ok=True)
-        generate(path, chosen.body(), chosen.plan)
+    if arguments.generate or arguments.differentiate:
+        (make if arguments.generate else differentiate_all)(arguments.generate or arguments.differentiate)
         return
     path = RESULTS / f"{arguments.name}.json"
     found = json.loads(path.read_text())["figures"] if path.exists() else {}
@@ -128,7 +163,8 @@ def main() -> None:
                 if arguments.only not in row.key:
                     continue
                 if row.key not in found:
-                    found[row.key] = run(row, {name: data}, problem)
+                    learned = data_of(name, arguments.ranks, True) if row.jacobians else None
+                    found[row.key] = run(row, {name: data}, problem, learned)
                     write(path.stem, found)
                 show(row.key, found[row.key])
 
