@@ -83,11 +83,12 @@ def make_twin(
     Raises:
         ConfigError: equilibria were solved there on another mesh.
     """
-    training_plan(space.config.training, device, processes)  # refused before the hour that the equilibria take
+    plan = training_plan(space.config.training, device, processes)  # refused before the hour that equilibria take
     say(f"1/4 mesh: {space.config.body.source}")
     body = _mesh(space, say)
     say(f"    {len(body.points)} nodes, {len(body.cells)} cells, {len(body.fixed)} fixed, {1e3 * body.volume:.2f} l")
     check_loads(body, load_plan(space.config))
+    plan.architecture.check(body)
     say(_indented((space.folder / "mesh_quality.txt").read_text()))
     say("2/4 generate: eigenmodes, modal loads, equilibria")
     _generate(space, body, path, say, again)

@@ -255,7 +255,7 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 @click.option("--samples", type=int, default=512, show_default=True, help="Equilibria to learn from.")
 @click.option("--jacobians", is_flag=True, help="Learn from the Jacobians of the equilibria too (takes longer).")
 @click.option(
-    "--path", type=int, default=1, show_default=True, help="Draws that share a load at growing sizes (cheaper)."
+    "--ramp", type=int, default=1, show_default=True, help="Draws that share a load at growing sizes (cheaper)."
 )
 @click.option(
     "--seconds", type=float, default=120.0, show_default=True, help="Wall time to train; ends with the step under way."
@@ -311,7 +311,7 @@ def build(
             "validation": max(8, given["samples"] // 8),
             "test": max(8, given["samples"] // 4),
             "ranks": given["ranks"],
-            "path": given["path"],
+            "ramp": given["ramp"],
             "jacobians": given["jacobians"],
         },
         "training": {"seconds": given["seconds"]},

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tomlkit
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from softtwin.meshes.attachment import parse_file
 from softtwin.meshes.files import Frame
@@ -112,8 +112,10 @@ class SamplesSection(_Section):
     validation: Count = Field(64, description="draws to choose the best weights with")
     test: Count = Field(128, description="draws held out, never seen in training")
     block: Count = Field(8, description="draws in one block of work")
-    path: Count = Field(
-        1, description="draws that share a load at growing sizes, each solved from the one before; divides block"
+    ramp: Count = Field(
+        1,
+        validation_alias=AliasChoices("ramp", "path"),
+        description="draws that share a load at growing sizes, each solved from the one before; divides block",
     )
     jacobians: bool = Field(
         False,
@@ -124,9 +126,9 @@ class SamplesSection(_Section):
     ranks: int = Field(0, ge=0, description="MPI ranks that build and quickstart start; 0: one a core")
 
     @model_validator(mode="after")
-    def _path_divides_block(self) -> SamplesSection:
-        if self.block % self.path:
-            raise ValueError(f"samples.path: expected a divisor of samples.block ({self.block}), got {self.path}")
+    def _ramp_divides_block(self) -> SamplesSection:
+        if self.block % self.ramp:
+            raise ValueError(f"samples.ramp: expected a divisor of samples.block ({self.block}), got {self.ramp}")
         return self
 
 

@@ -46,7 +46,7 @@ def plan_entries(config: Config) -> dict[str, Any]:
         "loads": loads,
         "samples": {"train": samples.train, "validation": samples.validation, "test": samples.test},
         "block": samples.block,
-        "path": samples.path,
+        "ramp": samples.ramp,
         "seed": samples.seed,
         "newton": config.solver.model_dump(),
     }

@@ -45,7 +45,7 @@ def main() -> None:
         "--output",
         folder / "out",
     ]
-    words += ["--zone", f"reach={folder / 'reach_mm.txt'}", "--displacement", 0.05, "--path", 8]
+    words += ["--zone", f"reach={folder / 'reach_mm.txt'}", "--displacement", 0.05, "--ramp", 8]
     words += ["--young-modulus", YOUNG_MODULUS, "--poisson-ratio", POISSON_RATIO]
     words += ["--nodes", arguments.nodes, "--samples", arguments.samples, "--seconds", arguments.seconds]
     softtwin([str(word) for word in words])

@@ -33,8 +33,8 @@ def liver_config(seconds: float, ranks: int) -> Config:
             "folder": ".",
             "material": {"young_modulus": YOUNG_MODULUS, "poisson_ratio": POISSON_RATIO},
             "loads": {"zones": list(SEQUENCES), "patches": 1, "radius": (0.25, 0.8), "displacement": 0.1},
-            # Many directions of load teach more than many sizes of each: 680 paths of two, not 192 of eight.
-            "samples": {"train": 1360, "validation": 96, "test": 192, "block": 8, "path": 2, "ranks": ranks},
+            # Many directions of load teach more than many sizes of each: 680 ramps of two, not 192 of eight.
+            "samples": {"train": 1360, "validation": 96, "test": 192, "block": 8, "ramp": 2, "ranks": ranks},
             "solver": {"tolerance": 1e-6, "max_iterations": 30, "max_load_steps": 6},
             "training": {"seconds": seconds, "width": 512},
         }

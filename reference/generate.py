@@ -32,6 +32,7 @@ from .data.dataset import (
     drop_block,
     existing,
     probe_cotangents,
+    stored_plan,
     write_block,
 )
 from .data.lock import locked
@@ -65,7 +66,7 @@ class Plan:
         loads: how loads are drawn.
         samples: draws of each split.
         block: draws of one block, the unit of work and of storage.
-        path: draws that share one load at growing sizes, each solved from the one before; divides `block`. Several
+        ramp: draws that share one load at growing sizes, each solved from the one before; divides `block`. Several
             times cheaper a draw than independent loads where these need many Newton iterations from rest.
         seed: seed of everything random.
         newton: options of the solver.
@@ -77,7 +78,7 @@ class Plan:
     loads: LoadPlan = field(default_factory=LoadPlan)
     samples: Mapping[str, int] = field(default_factory=lambda: {"train": 256, "validation": 32, "test": 64})
     block: int = 16
-    path: int = 1
+    ramp: int = 1
     seed: int = 0
     newton: NewtonOptions = field(default_factory=NewtonOptions)
 
@@ -90,8 +91,8 @@ class Plan:
             )
         if self.block < 1:
             raise ValueError(f"Plan.block: expected at least 1, got {self.block}.")
-        if self.path < 1 or self.block % self.path:
-            raise ValueError(f"Plan.path: expected a divisor of the block ({self.block}), got {self.path}.")
+        if self.ramp < 1 or self.block % self.ramp:
+            raise ValueError(f"Plan.ramp: expected a divisor of the block ({self.block}), got {self.ramp}.")
         self.build_material()
 
     def build_material(self) -> Material:
@@ -101,7 +102,7 @@ class Plan:
 
 def plan_from_header(header: Mapping[str, Any]) -> Plan:
     """The plan that a data set was made with."""
-    stored = dict(header["plan"])
+    stored = stored_plan(header)
     loads = {**stored["loads"], "zones": tuple(stored["loads"]["zones"]), "radius": tuple(stored["loads"]["radius"])}
     return Plan(**{**stored, "loads": LoadPlan(**loads), "newton": NewtonOptions(**stored["newton"])})
 
@@ -334,34 +335,34 @@ def solve_block(path: str, block: int) -> int:
     """
     data, plan, problem = opened(path)
     with threadpool_limits(1):
-        paths = range(block * plan.block // plan.path, (block + 1) * plan.block // plan.path)
-        rows = [row for number in paths for row in _solve_path(data, plan, problem, number)]
+        ramps = range(block * plan.block // plan.ramp, (block + 1) * plan.block // plan.ramp)
+        rows = [row for number in ramps for row in _solve_ramp(data, plan, problem, number)]
     write_block(Path(path), block, {name: np.stack([row[name] for row in rows]) for name in rows[0]})
     return block
 
 
-def path_loads(data: DataSet, plan: Plan, path: int) -> tuple[Floats, Floats]:
-    """One load and its growing sizes: nodal forces (n, 3) in newtons and factors (plan.path,).
+def ramp_loads(data: DataSet, plan: Plan, ramp: int) -> tuple[Floats, Floats]:
+    """One load and its growing sizes: nodal forces (n, 3) in newtons and factors (plan.ramp,).
 
     Args:
         data: gives body, modes, linear response and calibrated amplitude.
         plan: what is generated.
-        path: number of the path; everything is a function of it and the seed.
+        ramp: number of the ramp; everything is a function of it and the seed.
     """
-    rng = np.random.default_rng([plan.seed, 2, path])
+    rng = np.random.default_rng([plan.seed, 2, ramp])
     load = draw_load(data.body, data.shapes, plan.loads, rng)
     if plan.loads.amplitude is not None:
-        return plan.loads.amplitude * load, np.linspace(0.0, 1.0, plan.path + 1)[1:]
+        return plan.loads.amplitude * load, np.linspace(0.0, 1.0, plan.ramp + 1)[1:]
     top = data.header["amplitude"] / _peak(data.response.apply(load[None, data.response.loaded])[0])
-    return top * load, np.sort(rng.uniform(0.0, 1.0, plan.path))
+    return top * load, np.sort(rng.uniform(0.0, 1.0, plan.ramp))
 
 
-def _solve_path(data: DataSet, plan: Plan, problem: Problem, path: int) -> Iterator[dict[str, Any]]:
-    load, factors = path_loads(data, plan, path)
+def _solve_ramp(data: DataSet, plan: Plan, problem: Problem, ramp: int) -> Iterator[dict[str, Any]]:
+    load, factors = ramp_loads(data, plan, ramp)
     loaded = data.response.loaded
     state: Equilibrium | None = None
     for i, factor in enumerate(factors):
-        probe = np.random.default_rng([plan.seed, 3, path * plan.path + i]).standard_normal(len(data.shapes))
+        probe = np.random.default_rng([plan.seed, 3, ramp * plan.ramp + i]).standard_normal(len(data.shapes))
         row = data.sizes.failed() | {"forces": factor * load[loaded], "probes": probe}
         guess = None if state is None else _ahead(problem, state.displacement, (factor - factors[i - 1]) * load)
         try:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor, nn
 
+from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples
 
 from .maps import LinearMaps
@@ -117,6 +118,13 @@ class Architecture(Protocol):
     """Samples a step, where a plan says none."""
     optimizer: ClassVar[Any]
     """What `torch.optim` calls it."""
+
+    def check(self, body: Body) -> None:
+        """Refuse a body that it cannot learn on, before equilibria are solved for it.
+
+        Raises:
+            ValueError: what is wrong with the body.
+        """
 
     def lesson(self, data: DataSet, train: Samples, validation: Samples) -> Any:
         """A `Lesson` with fresh weights."""

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples
 
 from .architecture import Network
@@ -42,6 +43,9 @@ class Perceptron:
     def __post_init__(self) -> None:
         if self.width is not None and self.width < 1:
             raise ValueError(f"Perceptron.width: expected at least 1, got {self.width}.")
+
+    def check(self, body: Body) -> None:
+        """Any body will do."""
 
     def lesson(self, data: DataSet, train: Samples, validation: Samples) -> PerceptronLesson:
         """A `Lesson` with fresh weights."""

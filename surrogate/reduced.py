@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, LinearResponse, Samples, probe_cotangents
 from softtwin.reference.data.jacobians import Jacobians, read_jacobians
 
@@ -68,6 +69,9 @@ class Reduced:
                 raise ValueError(f"Reduced.{name}: expected at least 1, got {getattr(self, name)}.")
         if not 0.0 <= self.sobolev < np.inf:
             raise ValueError(f"Reduced.sobolev: expected a number not below 0, got {self.sobolev}.")
+
+    def check(self, body: Body) -> None:
+        """Any body will do."""
 
     def lesson(self, data: DataSet, train: Samples, validation: Samples) -> ReducedLesson:
         """A `Lesson` with fresh weights."""

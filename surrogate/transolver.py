@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples
 
 from .scaled import FieldLesson, FieldNetwork
@@ -44,6 +45,9 @@ class Transolver:
                 raise ValueError(f"Transolver.{name}: expected at least 1, got {getattr(self, name)}.")
         if self.width % self.heads:
             raise ValueError(f"Transolver.width: expected a multiple of {self.heads} heads, got {self.width}.")
+
+    def check(self, body: Body) -> None:
+        """Any body will do."""
 
     def lesson(self, data: DataSet, train: Samples, validation: Samples) -> TransolverLesson:
         """A `Lesson` with fresh weights."""

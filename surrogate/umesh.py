@@ -53,6 +53,14 @@ class UMesh:
         if self.numbering not in ("short", "long"):
             raise ValueError(f"UMesh.numbering: expected 'short' or 'long', got {self.numbering!r}.")
 
+    def check(self, body: Body) -> None:
+        """Refuse a body whose nodes are not those of a regular grid.
+
+        Raises:
+            ValueError: see `lattice`.
+        """
+        lattice(body)
+
     def lesson(self, data: DataSet, train: Samples, validation: Samples) -> UMeshLesson:
         """A `Lesson` with fresh weights.
 
@@ -83,7 +91,10 @@ def lattice(body: Body) -> tuple[Ints, tuple[int, int, int]]:
         ValueError: it is of other cells, or its nodes are not those of a regular grid.
     """
     if body.kind.name != "hexahedron":
-        raise ValueError(f"lattice.body: expected linear hexahedra on a regular grid, got {body.kind.name} cells.")
+        raise ValueError(
+            f"lattice.body: expected linear hexahedra on a regular grid, got {body.kind.name} cells; "
+            "put the organ on one (`build --grid`)."
+        )
     corners = body.points[body.cells]
     edges = np.ptp(corners, axis=1)
     places = (body.points - body.points.min(axis=0)) / edges[0]
@@ -92,7 +103,7 @@ def lattice(body: Body) -> tuple[Ints, tuple[int, int, int]]:
     if off > _ROUND_OFF:
         raise ValueError(
             f"lattice.body: expected hexahedra of a regular grid along the axes, got nodes up to {off:.3g} cells away "
-            "from one; make the body with shapes.beam or meshes.grid.sparse_grid."
+            "from one; make the body with shapes.beam or meshes.grid.gridded (`build --grid`)."
         )
     x, y, z = (int(count) for count in positions.max(axis=0) + 1)
     return positions, (x, y, z)

@@ -305,6 +305,7 @@ class DataSet:
 
 
 _SKIN = ("points", "triangles")
+_RENAMED = {"path": "ramp"}  # entries of a plan that data sets may still have under older names
 _BEYOND_REPAIR = (
     "truncated or changed. Bring a copy back, or make the whole data set again (`softtwin generate --again`)."
 )
@@ -411,6 +412,12 @@ def probe_cotangents(body: Body, shapes: Floats, probes: Floats) -> Floats:
     return cotangents
 
 
+def stored_plan(header: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries of the plan in a header, under today's names."""
+    entries: dict[str, Any] = header.get("plan", {})
+    return {_RENAMED.get(name, name): value for name, value in entries.items()}
+
+
 def differences(data: DataSet, body: Body, plan: Mapping[str, Any]) -> list[str]:
     """What keeps a data set from being one of a body and a plan: a few words each, none where it is.
 
@@ -426,7 +433,7 @@ def differences(data: DataSet, body: Body, plan: Mapping[str, Any]) -> list[str]
         sets = data.body.node_sets, body.node_sets
         zones = plan.get("loads", {}).get("zones", ())
         found += [f"the zone {name!r}" for name in zones if not _same_nodes(*(nodes.get(name) for nodes in sets))]
-    return found + _plan_differences(data.header["plan"], plan)
+    return found + _plan_differences(stored_plan(data.header), plan)
 
 
 def existing(path: Path) -> DataSet | None:

@@ -265,7 +265,7 @@ def unsolved(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.parametrize(
     ("flag", "value", "message", "meshed"),
     [
-        ("--path", 3, "samples.path: expected a divisor of samples.block (8), got 3", False),
+        ("--ramp", 3, "samples.ramp: expected a divisor of samples.block (8), got 3", False),
         ("--displacement", 50.0, "LoadPlan.displacement: expected at most the size of the body", True),
         ("--zone", "tool=fixed.txt", "is on the free boundary", True),
     ],
@@ -297,7 +297,7 @@ def test_one_block_too_many_is_refused(capsys, copy: Path) -> None:
         ("all of the boundary fixed", "expected free nodes on the boundary"),
         ("no body", "softtwin mesh"),
         ("no configuration", "is no TOML"),
-        ("wrong entry", "samples.path: expected a divisor"),
+        ("wrong entry", "samples.ramp: expected a divisor"),
     ],
 )
 def test_ranks_end_together_with_one_message(
@@ -316,7 +316,7 @@ def test_ranks_end_together_with_one_message(
     elif case == "no configuration":
         (copy / "organ.toml").write_text("[body\n")
     else:
-        edit(copy, "path = 1", "path = 5")
+        edit(copy, "ramp = 1", "ramp = 5")
     if "fixed" in case:
         main(["mesh", str(copy / "organ.toml")])
     program = [sys.executable, "-m", "softtwin.app.cli", "generate", str(copy / "organ.toml")]
@@ -405,6 +405,15 @@ def test_jacobians_are_made_where_they_are_wanted(copy: Path) -> None:
     assert "there already: 10 equilibria accepted, 0 rejected, Jacobians of 4 modes" in build(copy, **wanted)
     build(copy, **wanted, training={"modes": 3})
     assert stored_modes(DataSet(copy / "data.zarr")).shape[1] == 3
+
+
+def test_a_body_that_the_network_cannot_learn_on_is_refused_before_anything_is_solved(tmp_path: Path) -> None:
+    write_files(tmp_path, bar())
+    with pytest.raises(
+        ValueError, match=r"regular grid, got tetrahedron cells; put the organ on one \(`build --grid`\)"
+    ):
+        build(tmp_path, training={"architecture": "umesh", "modes": 64, "width": 256})
+    assert not (tmp_path / "data.zarr").exists()
 
 
 def test_jacobians_for_a_network_that_reads_none_are_refused() -> None:

@@ -218,6 +218,7 @@ def test_options_that_came_later_had_their_defaults_before(undisturbed: DataSet,
     attributes = zarr.open_group(str(path), mode="r+").attrs
     header = json.loads(attributes["header"])
     del header["plan"]["newton"]["max_load_steps"], header["checksums"]
+    header["plan"]["path"] = header["plan"].pop("ramp")  # its name then
     attributes["header"] = json.dumps(header)
     assert_same(undisturbed, generate(path, body(), PLAN))
     with pytest.raises(DataSetError, match=r"newton\.max_load_steps"):
@@ -232,8 +233,8 @@ def test_two_do_not_write_one_data_set(undisturbed: DataSet, tmp_path: Path, mon
     shutil.copytree(undisturbed.path, path)
     monkeypatch.setattr(farm, "_PATIENCE_S", 0.1)
     program = (
-        "import pathlib, sys, time; from softtwin.reference.generate import _locked\n"
-        "with _locked(pathlib.Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
+        "import pathlib, sys, time; from softtwin.reference.generate import writing\n"
+        "with writing(pathlib.Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     holder = subprocess.Popen([sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE, text=True)
     try:
