@@ -1,6 +1,7 @@
 """Networks against the reference: tables 4.1, 4.2 and 4.5 of the thesis, physics in the loss, error against samples.
 
     python benchmarks/networks.py [--tables 4.2 physics ...] [--ranks 2] [--train 8192] [--seconds 200]
+    python benchmarks/networks.py --tables thesis --data FOLDER --device cuda [--epochs 100] [--channels 128]
 
 Makes the data of the beam of 304 hexahedra under benchmarks/runs/ where they are not there (under mpirun; goes on where
 it was stopped). Each row is one training, judged on held-out samples of its own and of the other distribution, and is
@@ -13,10 +14,11 @@ import argparse
 import json
 import shutil
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -29,8 +31,6 @@ from softtwin.app.launch import generate_in_parallel
 from softtwin.app.stages.mesh import mesh_stage
 from softtwin.reference.data.dataset import DataSet, Samples, existing
 from softtwin.reference.data.jacobians import missing_jacobians
-from softtwin.reference.generate import plan_from_header
-from softtwin.reference.solve.problem import Problem
 from softtwin.surrogate.architecture import Architecture, Network
 from softtwin.surrogate.balance import balance
 from softtwin.surrogate.evaluate import evaluate, jacobian_errors, spread
@@ -38,11 +38,14 @@ from softtwin.surrogate.maps import LinearMaps
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.physics import Physics
-from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.plan import Device, TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
 from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
+
+if TYPE_CHECKING:
+    from softtwin.reference.solve.problem import Problem
 
 Floats = NDArray[np.float64]
 RUNS = Path(__file__).parent / "runs"
@@ -144,6 +147,17 @@ def rows(tables: list[str], train_count: int, seconds: float) -> Iterator[Row]:
             count *= 2
 
 
+def thesis_rows(architectures: Iterable[Architecture], epochs: int, device: Device) -> Iterator[Row]:
+    """The thesis's budget, for a GPU: all samples, so many epochs; U-Mesh in mixed precision, too."""
+    for architecture in architectures:
+        name = architecture.name
+        size = f", {architecture.channels} channels" if isinstance(architecture, UMesh) else ""
+        plan = TrainingPlan(architecture, epochs=epochs, device=device)
+        yield Row("thesis", f"{name}{size}, {epochs} epochs", plan)
+        if isinstance(architecture, UMesh):
+            yield Row("thesis", f"{name}{size}, {epochs} epochs, mixed", replace(plan, precision="mixed"))
+
+
 PHYSICS = {
     "data": None,
     "energy alone": Physics(energy=1.0, data=0.0),
@@ -185,12 +199,13 @@ def linear_map(data: DataSet) -> Surrogate:
 
 
 def judged(
-    surrogate: Surrogate, data: DataSet, problem: Problem, with_jacobian: bool = True, pivots: int = PIVOTS
+    surrogate: Surrogate, data: DataSet, problem: Problem | None, with_jacobian: bool = True, pivots: int = PIVOTS
 ) -> dict[str, Any]:
     """All figures on the held-out samples of one distribution; Jacobians of large bodies by random loads."""
     found = {**evaluate(surrogate, data).as_dict()}
-    found["balance"] = balance(surrogate, data, limit=pivots, negative_pivots=problem.negative_pivots).as_dict()
-    if with_jacobian:
+    counted = None if problem is None else problem.negative_pivots
+    found["balance"] = balance(surrogate, data, limit=pivots, negative_pivots=counted).as_dict()
+    if with_jacobian and problem is not None:
         test = data.samples("test", JACOBIANS)
         few = Samples(*(getattr(test, n) for n in ("draws", "forces", "displacements", "probes", "adjoints")))
         probes = PROBES if 3 * len(data.response.loaded) > MOST_COLUMNS else None
@@ -199,7 +214,22 @@ def judged(
     return found
 
 
-def run(row: Row, data: dict[str, DataSet], problem: Problem, learned: DataSet | None = None) -> dict[str, Any]:
+@contextmanager
+def reference(data: DataSet) -> Iterator[Problem | None]:
+    """The problem that a data set is of; None, and said, where FEniCSx is absent (a machine lent for its GPU)."""
+    try:
+        from softtwin.reference.generate import plan_from_header
+        from softtwin.reference.solve.problem import Problem
+    except ModuleNotFoundError as error:
+        print(f"without {error.name}: no Jacobians and no pivots are compared")
+        yield None
+        return
+    plan = plan_from_header(data.header)
+    with Problem(data.body, plan.build_material(), plan.newton) as problem:
+        yield problem
+
+
+def run(row: Row, data: dict[str, DataSet], problem: Problem | None, learned: DataSet | None = None) -> dict[str, Any]:
     """Train, on other data than are judged where these are given, and judge one row."""
     began = time.perf_counter()
     own = learned or data[row.kind]
@@ -224,7 +254,7 @@ def show(key: str, figures: dict[str, Any]) -> None:
         f"{key:55} e {1e3 * own['nodal_error']['mean']:.4f} mm",
         f"relative {100 * own['relative_error']['median']:.3f} (95 % {100 * own['relative_error']['p95']:.2f}) %",
         f"cos {own['gradient_cosine']['mean']:.5f}",
-        f"Jacobian {100 * own['jacobian_error']['mean']:.1f} %",
+        f"Jacobian {100 * own['jacobian_error']['mean']:.1f} %" if "jacobian_error" in own else "no Jacobian",
         f"residual {residual}",
         f"of {sound['samples']} inside out {sound['inside_out']}, indefinite {sound['indefinite']}",
         f"f(0) {1e3 * sound['at_rest']:.3f} mm",
@@ -235,28 +265,36 @@ def show(key: str, figures: dict[str, Any]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tables", nargs="+", default=["4.2"], choices=["4.1", "4.2", "4.5", "physics", "samples"])
+    tables = ["4.1", "4.2", "4.5", "physics", "samples", "thesis"]
+    parser.add_argument("--tables", nargs="+", default=["4.2"], choices=tables)
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--train", type=int, default=8192)
     parser.add_argument("--seconds", type=float, default=200.0)
     parser.add_argument("--own-alone", action="store_true", help="leave the other distribution out")
+    parser.add_argument("--data", type=Path, help="modal data that are there, where FEniCSx is not")
+    parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"], help="of the table thesis")
+    parser.add_argument("--channels", type=int, default=128, help="of U-Mesh in the table thesis")
+    parser.add_argument("--epochs", type=int, default=EPOCHS, help="of the table thesis")
     parser.add_argument("--only", default="", help="rows that have this in their name")
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
     held_out = {"validation": 256, "test": 512}
-    data = {"modal": data_of("modal", {"train": arguments.train, **held_out}, arguments.ranks)}
-    if not arguments.own_alone:
+    counts = {"train": arguments.train, **held_out}
+    data = {"modal": DataSet(arguments.data) if arguments.data else data_of("modal", counts, arguments.ranks)}
+    if not arguments.own_alone and not arguments.data:
         count = arguments.train if "4.1" in arguments.tables else 16
         data["random"] = data_of("random", {"train": count, **held_out}, arguments.ranks)
     path = RESULTS / f"{arguments.name}.json"
     found = json.loads(path.read_text())["figures"] if path.exists() else {}
-    plan = plan_from_header(data["modal"].header)
-    with Problem(data["modal"].body, plan.build_material(), plan.newton) as problem:
-        for row in rows(arguments.tables, arguments.train, arguments.seconds):
+    with reference(data["modal"]) as problem:
+        wanted = list(rows(arguments.tables, arguments.train, arguments.seconds))
+        if "thesis" in arguments.tables:
+            kinds = (Reduced(), Perceptron(), UMesh(arguments.channels), Transolver())
+            wanted += thesis_rows(kinds, arguments.epochs, arguments.device)
+        for row in wanted:
             if arguments.only not in row.key:
                 continue
             if row.key not in found:
-                counts = {"train": arguments.train, **held_out}
                 learned = data_of("modal", counts, arguments.ranks, True) if row.jacobians else None
                 found[row.key] = run(row, data, problem, learned)
                 write(path.stem, found)

@@ -28,11 +28,20 @@ def machine() -> dict[str, Any]:
     return {
         "processor": model,
         "cores": available_cores(),
+        "gpu": _gpu(),
         "load_at_the_end": os.getloadavg()[0],
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in names},
         "threads": os.environ.get("OPENBLAS_NUM_THREADS", "not set"),
     }
+
+
+def _gpu() -> str:
+    try:
+        import torch
+    except ModuleNotFoundError:  # the reference alone
+        return "none"
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
 
 
 def _version(name: str) -> str:

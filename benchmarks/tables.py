@@ -93,13 +93,18 @@ def sequences(name: str) -> None:
     print(f"\nmean TRE of all: {sum(f['mean_tre_mm'] for f in each) / len(each):.3f} mm")
 
 
+def with_deviation(spread: dict[str, float], scale: float, form: str) -> str:
+    """Mean and standard deviation over samples."""
+    return f"{scale * spread['mean']:{form}} +- {scale * spread['std']:{form}}"
+
+
 def networks(name: str) -> None:
-    """Networks on the beam: held-out errors of both distributions, and how sound the predictions are."""
+    """Networks: held-out errors, means +- deviations over the samples, and how sound the predictions are."""
     found = figures(name)
     if not found:
         return
-    head(name, "e mm (largest)", "relative % (95 %)", "cosine", "Jacobian %", "residual", "inside out; indefinite",
-         "f(0) mm", "other loads: e mm", "steps; s")  # fmt: skip
+    errors = ("e mm", "largest mm", "norm / nodes um", "relative % (95 %)", "SNR dB", "cosine", "Jacobian %")
+    head(name, *errors, "residual", "inside out; indefinite", "f(0) mm", "other loads: e mm", "steps; s")
     for key, f in found.items():
         own = f[f["learned_from"]]
         sound, training = own["balance"], f["training"] or {}
@@ -107,10 +112,13 @@ def networks(name: str) -> None:
         residual = sound["residual"]
         row(
             key,
-            f"{1e3 * own['nodal_error']['mean']:.3f} ({1e3 * own['largest_error']['mean']:.2f})",
+            with_deviation(own["nodal_error"], 1e3, ".3f"),
+            with_deviation(own["largest_error"], 1e3, ".2f"),
+            with_deviation(own["thesis_error"], 1e6, ".2f"),
             f"{100 * own['relative_error']['median']:.3f} ({100 * own['relative_error']['p95']:.2f})",
+            with_deviation(own["signal_to_noise"], 1.0, ".1f"),
             f"{own['gradient_cosine']['mean']:.5f}",
-            f"{100 * own['jacobian_error']['mean']:.1f}",
+            f"{100 * own['jacobian_error']['mean']:.1f}" if "jacobian_error" in own else "-",
             "-" if residual is None else f"{residual['median']:.2g}",
             f"{sound['inside_out']}; {sound['indefinite']} of {sound['samples']}",
             f"{1e3 * sound['at_rest']:.3f}",
@@ -126,6 +134,7 @@ def main() -> None:
     sequences("registration_surrogate")
     networks("networks")
     networks("networks_physics")
+    networks("networks_bodies")
 
 
 if __name__ == "__main__":
