@@ -305,7 +305,8 @@ def fit(course: Course, path: Path, resume: bool, log: bool = False) -> None:
 
 
 def _together(device: str) -> DDPStrategy:
-    return DDPStrategy(start_method="spawn", process_group_backend="nccl" if device == "cuda" else "gloo")
+    backend = "nccl" if device == "cuda" else "gloo"  # the buffers are data, alike everywhere and never written
+    return DDPStrategy(start_method="spawn", process_group_backend=backend, broadcast_buffers=False)
 
 
 def _logs(folder: Path) -> list[Logger]:
