@@ -338,8 +338,9 @@ class ReducedLesson(nn.Module):
         # A sample meets other directions in other company: a function of the batch, so that training can go on.
         along = self.directions[(batch + batch.sum()) % len(self.directions)]
         (pulled,) = torch.autograd.grad(self.network(loads), loads, along, create_graph=True)
-        in_sample = torch.einsum("sij,si->sj", turns, along)
-        wanted = torch.einsum("sij,sjk,sk->si", turns, self.jacobians[batch % count], in_sample)
+        in_sample = torch.bmm(along[:, None], turns)  # one product at a time: einsum would begin with the matrices
+        of_sample = torch.bmm(self.jacobians[batch % count], in_sample.mT)
+        wanted = torch.bmm(turns, of_sample)[:, :, 0]
         missed = (pulled @ self.metric.T - wanted).square().sum(dim=1)
         return (missed * self.adjoint_weights[batch]).mean()
 
