@@ -17,6 +17,7 @@ import numpy as np
 import scipy
 import zarr
 from numpy.typing import NDArray
+from scipy.linalg import svd
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
@@ -49,7 +50,9 @@ from .solve.problem import NewtonOptions, Problem
 Floats = NDArray[np.float64]
 
 _EXACT_COLUMNS = 1500  # up to so many loaded unknowns the linear response is kept whole
-_RANK = 512  # else its best approximation of this rank: 0.04 % of the displacement on the beam
+_RANK = 512  # else its displacements in so many modes
+_ANY = 256  # of them for forces unlike those that are drawn
+_LEAST_MODE = 1e-6
 _PILOTS = 9
 _PATIENCE_S = 20.0  # ranks live on for a moment when their mpirun is killed
 _BEYOND = 2.0  # draws that move more than twice the wanted top are kept apart
@@ -173,7 +176,10 @@ def _prepare(path: Path, body: Body, plan: Plan, redo: Sequence[int], again: boo
         raise DataSetError(f"generate.redo: expected a data set with blocks {list(redo)} in {path}, found none.")
     with Problem(body, plan.build_material(), plan.newton) as problem:
         modes = eigenmodes(problem, plan.loads.modes)
-        response = linear_response(problem, loaded_nodes(body, plan.loads), plan.seed)
+        loaded = loaded_nodes(body, plan.loads)
+        chances = (np.random.default_rng([plan.seed, 4, i]) for i in range(_RANK))
+        loads = np.stack([draw_load(body, modes.shapes, plan.loads, rng)[loaded] for rng in chances])
+        response = linear_response(problem, loaded, loads, plan.seed)
         amplitude = plan.loads.amplitude or _calibrate(problem, response, modes.shapes, plan)
     header = {
         "plan": _plain(plan),
@@ -239,14 +245,19 @@ def versions() -> dict[str, str]:
     }
 
 
-def linear_response(problem: Problem, loaded: NDArray[np.int64], seed: int = 0) -> LinearResponse:
-    """K(0)^-1 for forces at the loaded nodes: whole if small, else of rank 512 by a randomised range finder.
+def linear_response(
+    problem: Problem, loaded: NDArray[np.int64], loads: Floats | None = None, seed: int = 0
+) -> LinearResponse:
+    """K(0)^-1 for forces at the loaded nodes: whole if small, else the projection of its displacements on 512 modes.
 
-    Source of the range finder: Halko, Martinsson, Tropp, SIAM Review 53 (2011), algorithm 4.4.
+    Most of these are the leading modes (POD) of the displacements under drawn loads, the others those that a
+    randomised range finder sees best for any forces (Halko, Martinsson, Tropp, SIAM Review 53 (2011), algorithm 4.4),
+    which is all that there is where no loads are given.
 
     Args:
         problem: body and material.
         loaded: numbers of the nodes that may carry force, (l,).
+        loads: forces at the loaded nodes, as they will be drawn, (s, l, 3), newtons.
         seed: seed of the random probes.
     """
     unknowns = (3 * loaded[:, None] + np.arange(3)).ravel()
@@ -255,14 +266,25 @@ def linear_response(problem: Problem, loaded: NDArray[np.int64], seed: int = 0) 
         columns = np.zeros((total, len(unknowns)))
         columns[unknowns, np.arange(len(unknowns))] = 1.0
         return LinearResponse(loaded, problem.apply_inverse(columns), np.eye(len(unknowns)))
-    probes = np.zeros((total, min(_RANK, len(unknowns))))
+    rank = min(_RANK, len(unknowns))
+    own = np.zeros((total, 0)) if loads is None else _leading_modes(problem, unknowns, loads, rank - _ANY)
+    probes = np.zeros((total, rank - own.shape[1]))
     probes[unknowns] = np.random.default_rng(seed).standard_normal((len(unknowns), probes.shape[1]))
     for _ in range(2):  # one power iteration sharpens the range
-        basis, _ = np.linalg.qr(problem.apply_inverse(probes))
+        basis, _ = np.linalg.qr(np.hstack([own, problem.apply_inverse(probes)]))
         back = problem.apply_inverse(basis)[unknowns]
         probes = np.zeros_like(probes)
-        probes[unknowns], _ = np.linalg.qr(back)
+        probes[unknowns], _ = np.linalg.qr(back[:, own.shape[1] :])
     return LinearResponse(loaded, basis, back.T)
+
+
+def _leading_modes(problem: Problem, unknowns: NDArray[np.int64], loads: Floats, most: int) -> Floats:
+    """Modes of the linear displacements under loads, each counting alike, (3n, r), down to a millionth."""
+    columns = np.zeros((3 * len(problem.body.points), len(loads)))
+    columns[unknowns] = loads.reshape(len(loads), -1).T
+    moved = problem.apply_inverse(columns)
+    modes, sizes, _ = svd(moved / np.linalg.norm(moved, axis=0), full_matrices=False, overwrite_a=True)
+    return np.ascontiguousarray(modes[:, : min(most, int((sizes > _LEAST_MODE * sizes[0]).sum()))])
 
 
 def _calibrate(problem: Problem, response: LinearResponse, shapes: Floats, plan: Plan) -> float:

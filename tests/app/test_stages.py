@@ -409,9 +409,7 @@ def test_jacobians_are_made_where_they_are_wanted(copy: Path) -> None:
 
 def test_a_body_that_the_network_cannot_learn_on_is_refused_before_anything_is_solved(tmp_path: Path) -> None:
     write_files(tmp_path, bar())
-    with pytest.raises(
-        ValueError, match=r"regular grid, got tetra cells; put the organ on one \(`build --grid`\)"
-    ):
+    with pytest.raises(ValueError, match=r"regular grid, got tetra cells; put the organ on one \(`build --grid`\)"):
         build(tmp_path, training={"architecture": "umesh", "modes": 64, "width": 256})
     assert not (tmp_path / "data.zarr").exists()
 

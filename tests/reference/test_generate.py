@@ -416,10 +416,22 @@ def test_the_linear_response_of_low_rank_is_close_to_the_whole(monkeypatch) -> N
         monkeypatch.setattr(farm, "_EXACT_COLUMNS", 0)
         monkeypatch.setattr(farm, "_RANK", 60)
         low = linear_response(problem, loaded)
-    forces = np.random.default_rng(0).standard_normal((3, len(loaded), 3))
-    assert low.left.shape[1] == 60 and low.right.shape == (60, 3 * len(loaded))
-    exact, close = whole.apply(forces), low.apply(forces)
-    assert np.linalg.norm(close - exact) < 0.03 * np.linalg.norm(exact)
+        forces = np.random.default_rng(0).standard_normal((3, len(loaded), 3))
+        assert low.left.shape[1] == 60 and low.right.shape == (60, 3 * len(loaded))
+        exact, close = whole.apply(forces), low.apply(forces)
+        assert np.linalg.norm(close - exact) < 0.03 * np.linalg.norm(exact)
+        monkeypatch.setattr(farm, "_RANK", 30)
+        monkeypatch.setattr(farm, "_ANY", 10)
+        # Loads that are sharper than what the range finder sees best: known ones are met, others as well as before.
+        patterns = np.random.default_rng(1).standard_normal((6, len(loaded), 3))
+        weights = np.random.default_rng(2).standard_normal((40, 6))
+        known, unknown = np.tensordot(weights[:30], patterns, 1), np.tensordot(weights[30:], patterns, 1)
+        drawn, blind = linear_response(problem, loaded, known), linear_response(problem, loaded)
+    assert drawn.left.shape[1] <= 30 and np.allclose(drawn.left.T @ drawn.left, np.eye(drawn.left.shape[1]), atol=1e-9)
+    missed = [np.linalg.norm(each.apply(unknown) - whole.apply(unknown)) for each in (drawn, blind)]
+    assert missed[0] < 1e-6 * np.linalg.norm(whole.apply(unknown)) < missed[1]
+    exact = whole.apply(forces)
+    assert np.linalg.norm(drawn.apply(forces) - exact) < 1.5 * np.linalg.norm(blind.apply(forces) - exact)
 
 
 @pytest.mark.parametrize(
