@@ -177,8 +177,7 @@ def _prepare(path: Path, body: Body, plan: Plan, redo: Sequence[int], again: boo
     with Problem(body, plan.build_material(), plan.newton) as problem:
         modes = eigenmodes(problem, plan.loads.modes)
         loaded = loaded_nodes(body, plan.loads)
-        chances = (np.random.default_rng([plan.seed, 4, i]) for i in range(_RANK))
-        loads = np.stack([draw_load(body, modes.shapes, plan.loads, rng)[loaded] for rng in chances])
+        loads = None if _is_whole(loaded) else _pilots(body, modes.shapes, plan)[:, loaded]
         response = linear_response(problem, loaded, loads, plan.seed)
         amplitude = plan.loads.amplitude or _calibrate(problem, response, modes.shapes, plan)
     header = {
@@ -262,7 +261,7 @@ def linear_response(
     """
     unknowns = (3 * loaded[:, None] + np.arange(3)).ravel()
     total = 3 * len(problem.body.points)
-    if len(unknowns) <= _EXACT_COLUMNS:
+    if _is_whole(loaded):
         columns = np.zeros((total, len(unknowns)))
         columns[unknowns, np.arange(len(unknowns))] = 1.0
         return LinearResponse(loaded, problem.apply_inverse(columns), np.eye(len(unknowns)))
@@ -278,12 +277,23 @@ def linear_response(
     return LinearResponse(loaded, basis, back.T)
 
 
+def _is_whole(loaded: NDArray[np.int64]) -> bool:
+    return 3 * len(loaded) <= _EXACT_COLUMNS
+
+
+def _pilots(body: Body, shapes: Floats, plan: Plan) -> Floats:
+    """Loads as they will be drawn, (s, n, 3), of no size."""
+    chances = (np.random.default_rng([plan.seed, 4, i]) for i in range(_RANK))
+    return np.stack([draw_load(body, shapes, plan.loads, rng) for rng in chances])
+
+
 def _leading_modes(problem: Problem, unknowns: NDArray[np.int64], loads: Floats, most: int) -> Floats:
     """Modes of the linear displacements under loads, each counting alike, (3n, r), down to a millionth."""
     columns = np.zeros((3 * len(problem.body.points), len(loads)))
     columns[unknowns] = loads.reshape(len(loads), -1).T
     moved = problem.apply_inverse(columns)
-    modes, sizes, _ = svd(moved / np.linalg.norm(moved, axis=0), full_matrices=False, overwrite_a=True)
+    scaled = moved / np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
+    modes, sizes, _ = svd(scaled, full_matrices=False, overwrite_a=True)
     return np.ascontiguousarray(modes[:, : min(most, int((sizes > _LEAST_MODE * sizes[0]).sum()))])
 
 
