@@ -165,7 +165,7 @@ class MeshQuality:
         nodes: number of nodes.
         cells: number of cells.
         kind: `tetrahedra` or `hexahedra`; in the plane `triangles` or `quadrilaterals`.
-        volume: total volume, cubic metres; area, square metres, in the plane.
+        volume: total volume, of a sparse grid's cells the filled part, cubic metres; area, square metres, in the plane.
         min_scaled_jacobian: worst cell, 1 is ideal, 0 flat.
         mean_scaled_jacobian: mean over the cells.
         min_radius_ratio: three times inradius over circumradius of the worst tetrahedron, 1 is ideal;
@@ -224,7 +224,7 @@ def mesh_quality(body: Body) -> MeshQuality:
         nodes=len(body.points),
         cells=len(body.cells),
         kind=_PLURALS[body.kind.shape],
-        volume=float(volumes.sum()),
+        volume=float(volumes.sum() if body.fractions is None else body.fractions @ volumes),
         min_scaled_jacobian=float(jacobians.min()),
         mean_scaled_jacobian=float(jacobians.mean()),
         min_radius_ratio=float(ratio),

@@ -8,6 +8,7 @@ from softtwin.meshes.body import Body, BodyError, Surface
 from softtwin.meshes.checks import compacted
 from softtwin.meshes.embedding import outer, outer_nodes
 from softtwin.meshes.grid import SparseGrid, gridded, sparse_grid
+from softtwin.meshes.metrics import mesh_quality
 from softtwin.meshes.shapes import beam
 
 EPS = np.finfo(float).eps
@@ -266,6 +267,7 @@ def test_a_gridded_body_keeps_its_surface_sets_and_inner_structures(liver: Body)
     surface = outer(body)
     assert body.kind.name == "hexahedron" and body.inner.keys() == liver.inner.keys()
     assert body.volume == pytest.approx(liver.volume, rel=0.02)
+    assert mesh_quality(body).volume == pytest.approx(body.volume)
     assert np.array_equal(surface.rest.points[surface.rest.triangles], liver.points[liver.boundary])
     assert np.array_equal(surface.rest.points[body.surfaces["observed"]], liver.points[seen])
     assert np.isin(liver.points[held], surface.rest.points[surface.vertices_of(body.node_sets["held"])]).all()
