@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import os
 import signal
 from dataclasses import replace
@@ -119,21 +120,28 @@ def test_two_processes_learn_what_one_learns(data: DataSet, tmp_path: Path, capf
     assert _same(two, train(data, replace(plan, processes=2), tmp_path))  # finished: nothing is trained again
 
 
+CLOCK = """
+import torch
+
 class Counted:
-    """A clock that goes on by a hundredth with each look; a second process's own would end at once."""
+    looks = 0.0
 
-    def __init__(self) -> None:
-        self.looks = 0.0
-
-    def __call__(self) -> float:
+    def __call__(self):
         self.looks += 1.0
         ranked = torch.distributed.is_initialized() and torch.distributed.get_rank() > 0
         return self.looks * (10.0 if ranked else 0.01)
+"""
 
 
-def test_the_clock_of_the_first_process_ends_all(data: DataSet) -> None:
+def test_the_clock_of_the_first_process_ends_all(
+    data: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that goes on by a hundredth with each look; a second process's own would end at once."""
+    (tmp_path / "counted_clock.py").write_text(CLOCK)  # a module, for processes that do not know the tests
+    monkeypatch.syspath_prepend(tmp_path)
+    made = importlib.import_module("counted_clock").Counted
     plan = TrainingPlan(Reduced(modes=8, width=16), seconds=1.5)
-    one, two = (train(data, replace(plan, processes=each), clock=Counted()) for each in (1, 2))
+    one, two = (train(data, replace(plan, processes=each), clock=made()) for each in (1, 2))
     assert two.card["training"]["steps"] == one.card["training"]["steps"] > 40
 
 
