@@ -331,6 +331,8 @@ def _quiet() -> Iterator[None]:
 def _hush() -> None:
     for name in _ADVISERS:
         logging.getLogger(name).setLevel(logging.ERROR)
+    # Its successor would send all buffers, which are the data, at the start; older torch does not know it.
+    warnings.filterwarnings("ignore", message=".*broadcast_buffers.*is deprecated")
     warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
     warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated", category=FutureWarning)
     warnings.filterwarnings("ignore", category=UserWarning, module=r"lightning\.")
