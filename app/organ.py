@@ -43,6 +43,7 @@ from .config import BodySection, ConfigError, files_frame
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 SHAPES: dict[str, Callable[..., Body]] = {"liver-phantom": liver_phantom, "propeller": propeller, "beam": beam}
+_COARSEST = 0.2  # of the body's size: the edge of a grid's cells
 _MOSTLY = 0.5  # of an inner surface's vertices: more outside the body, and it belongs to another one
 _TOUCHING = 1e-3  # of the body's size: nearer to it a point outside is round-off of the mesh
 
@@ -117,11 +118,25 @@ def make_organ(section: BodySection, root: Path) -> Organ:
         observed, said = _observed(body, regions["observed"], reader)
         body, notes = replace(body, surfaces={**body.surfaces, "observed": observed}), [*notes, *said]
     if section.grid > 0.0:
-        whole = body.volume
-        body = gridded(body, section.grid)
-        notes.append(f"grid: {len(body.cells)} hexahedra of {1e3 * section.grid:g} mm, {body.volume / whole:.4f} of "
-                     "the volume")  # fmt: skip
+        body, line = _on_grid(body, section.grid)
+        notes.append(line)
     return Organ(body, tuple(notes))
+
+
+def _on_grid(body: Body, edge: float) -> tuple[Body, str]:
+    """The body on a regular grid, and what to say of it.
+
+    Raises:
+        BodyError: cells as large as the organ; see also `gridded`.
+    """
+    if edge > _COARSEST * body.size:
+        raise BodyError(
+            f"body.grid: expected an edge length in metres of at most {_COARSEST:g} of the organ's size "
+            f"({body.size:.3g} m), got {edge:g} m."
+        )
+    grid = gridded(body, edge)
+    share = grid.volume / body.volume
+    return grid, f"grid: {len(grid.cells)} hexahedra of {1e3 * edge:g} mm, {share:.4f} of the volume"
 
 
 def _check_stated_frame(section: BodySection, root: Path) -> None:

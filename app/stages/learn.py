@@ -28,6 +28,7 @@ from softtwin.surrogate.twin import load, save
 from ..config import ConfigError, TrainingSection, to_toml
 from ..inputs import check_trained, current_data, train_inputs, validate_inputs
 from ..workspace import Workspace, locked, timed, write_whole
+from .generate import lacks_jacobians
 
 
 def train_stage(space: Workspace, fresh: bool = False, device: Device = "auto", processes: int = 1) -> Surrogate:
@@ -40,11 +41,17 @@ def train_stage(space: Workspace, fresh: bool = False, device: Device = "auto", 
         processes: that train together.
 
     Raises:
-        ConfigError: there is no body, or one of another configuration; or another `train` is at work there.
+        ConfigError: there is no body, or one of another configuration; another `train` is at work there; Jacobians are
+            wanted that are not there.
         DataSetError: the data set is missing, damaged, not complete, or of another body or configuration.
         CheckpointError: the checkpoint is truncated, or of another plan or data set.
     """
     data, _ = current_data(space)
+    if lacks_jacobians(space.config, data):
+        raise ConfigError(
+            f"samples.jacobians: those in {space.data} are not there, not all, or of other modes than the network is "
+            "to have; run `softtwin generate` again, it makes them."
+        )
     with locked(space, "train"):
         return _train(space, data, fresh, training_plan(space.config.training, device, processes))
 

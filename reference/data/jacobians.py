@@ -128,7 +128,7 @@ def write_jacobians(path: Path, block: int, values: Floats, squares: Floats) -> 
     group["checksum"][block] = _checksum(*typed)
 
 
-_AGAIN = "run `softtwin generate` again with the same configuration, it makes what is missing."
+_AGAIN = "run `softtwin generate` again with samples.jacobians = true, it makes what is missing."
 
 
 def _block_count(data: DataSet) -> int:

@@ -23,7 +23,7 @@ from softtwin.app.config import Config, ConfigError, to_toml
 from softtwin.app.doctor import available_cores
 from softtwin.app.stages.learn import train_stage
 from softtwin.app.workspace import locked, open_workspace, read_records, timed
-from softtwin.meshes.body import Body
+from softtwin.meshes.body import Body, BodyError
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import outer
 from softtwin.meshes.files import read_body, write_body
@@ -403,8 +403,17 @@ def test_jacobians_are_made_where_they_are_wanted(copy: Path) -> None:
     assert modes is not None and modes.shape[1] == 4
     assert (copy / "twin" / "surrogate.safetensors").read_bytes() != weights
     assert "there already: 10 equilibria accepted, 0 rejected, Jacobians of 4 modes" in build(copy, **wanted)
+    edit(copy, "modes = 4 # displacement modes", "modes = 3 # displacement modes")
+    with pytest.raises(ConfigError, match=r"samples\.jacobians: .* of other modes .* run `softtwin generate` again"):
+        train_stage(open_workspace(copy / "organ.toml"), fresh=True)
     build(copy, **wanted, training={"modes": 3})
     assert stored_modes(DataSet(copy / "data.zarr")).shape[1] == 3
+
+
+def test_a_grid_as_coarse_as_the_organ_is_refused(tmp_path: Path) -> None:
+    write_files(tmp_path, bar())
+    with pytest.raises(BodyError, match=r"body\.grid: expected an edge length in metres .* got 80 m"):
+        build(tmp_path, body={"grid": 80.0})
 
 
 def test_a_body_that_the_network_cannot_learn_on_is_refused_before_anything_is_solved(tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ def test_what_is_missing_or_damaged_is_made_again(copy: Path, modes: np.ndarray)
     chunk.write_bytes(chunk.read_bytes()[:-7])
     (copy / "jacobians" / "checksum" / "c" / "2").unlink()
     assert missing_jacobians(DataSet(copy)) == [1, 2]
-    with pytest.raises(DataSetError, match=r"block 1 .*run `softtwin generate` again"):
+    with pytest.raises(DataSetError, match=r"block 1 .*run `softtwin generate` again with samples\.jacobians = true"):
         read_jacobians(DataSet(copy), draws)
     first = read_jacobians(DataSet(copy), draws[:1])
     assert first is not None and len(first.values) == 1
