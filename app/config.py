@@ -120,7 +120,7 @@ class SamplesSection(_Section):
     jacobians: bool = Field(
         False,
         description="also the Jacobian of each training equilibrium in the reduced network's modes, which tell it more "
-        "than further samples do; takes up to as long again",
+        "than further samples do; takes about half as long again",
     )
     seed: int = Field(0, ge=0, description="seed of everything random")
     ranks: int = Field(0, ge=0, description="MPI ranks that build and quickstart start; 0: one a core")

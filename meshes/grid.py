@@ -180,7 +180,7 @@ def gridded(
         spacing: edge length of cubic cells, metres; see `sparse_grid`. Give this or `cells_per_axis`.
         cells_per_axis: cells along x, y and z.
         smallest: fraction below which cells are dropped; larger than there, since a force on the skin moves the loose
-            corners of a nearly empty cell by much more than the organ (with 1e-3 fifteen times as far on a liver of
+            corners of a nearly empty cell by much more than the organ (with 1e-3 thirteen times as far on a liver of
             3,700 cells).
 
     Raises:
