@@ -116,8 +116,6 @@ class Architecture(Protocol):
     """Learning rate, where a plan says none."""
     batch: ClassVar[int]
     """Samples a step, where a plan says none."""
-    optimizer: ClassVar[Any]
-    """What `torch.optim` calls it."""
 
     def check(self, body: Body) -> None:
         """Refuse a body that it cannot learn on, before equilibria are solved for it.
@@ -128,6 +126,9 @@ class Architecture(Protocol):
 
     def lesson(self, data: DataSet, train: Samples, validation: Samples) -> Any:
         """A `Lesson` with fresh weights."""
+
+    def optimizer(self, network: Any, rate: float) -> torch.optim.Optimizer:
+        """What trains the lesson's network; its rate is set before every step."""
 
     @staticmethod
     def revived(tensors: Mapping[str, Tensor]) -> Network:

@@ -146,9 +146,8 @@ class Course(lightning.LightningModule):
         return self.seconds / self.plan.seconds if self.steps is None else self.steps_made / self.steps
 
     def configure_optimizers(self) -> Any:
-        """The architecture's; its rate is set before every step."""
-        architecture, weights = self.plan.architecture, self.lesson.network.parameters()
-        return architecture.optimizer(weights, lr=self.plan.rate, fused=True)
+        """The architecture's."""
+        return self.plan.architecture.optimizer(self.lesson.network, self.plan.rate)
 
     def train_dataloader(self) -> Batches:
         """Sample numbers of the steps of the current round."""

@@ -38,7 +38,6 @@ class Perceptron:
     name: ClassVar[str] = "mlp"
     rate: ClassVar[float] = 1e-3
     batch: ClassVar[int] = 50
-    optimizer: ClassVar[type[torch.optim.Optimizer]] = torch.optim.Adam
 
     def __post_init__(self) -> None:
         if self.width is not None and self.width < 1:
@@ -50,6 +49,10 @@ class Perceptron:
     def lesson(self, data: DataSet, train: Samples, validation: Samples) -> PerceptronLesson:
         """A `Lesson` with fresh weights."""
         return PerceptronLesson(data, train, validation, self)
+
+    def optimizer(self, network: nn.Module, rate: float) -> torch.optim.Optimizer:
+        """Adam."""
+        return torch.optim.Adam(network.parameters(), lr=rate, fused=True)
 
     @staticmethod
     def revived(tensors: Mapping[str, Tensor]) -> HiddenLayers:

@@ -23,6 +23,7 @@ from softtwin.reference.data.jacobians import Jacobians, read_jacobians
 
 from .architecture import Network
 from .maps import LinearMaps, response_parts
+from .optimizers import MuonWithAdamW
 from .pod import ReducedBasis, basis_of, learned_basis, semi_relative, sizes_of
 
 Floats = NDArray[np.float64]
@@ -31,6 +32,8 @@ _GATE = 0.1  # size of the scaled input, relative to its usual one, below which 
 _ROOT_HALF, _DENSITY = 0.5**0.5, float((2.0 * np.pi) ** -0.5)  # of the normal law in the GELU
 _TINY = 1e-30  # a number in single precision, too
 _DIRECTIONS = 8192  # that Jacobians are looked at in
+_LEAST_SPREAD = 0.3  # of the largest: coordinates that training loads hardly have, and others may, are not whitened
+_WEIGHT_DECAY = 0.2  # less of it is more exact on loads like those of the training, and worse on others
 _SHARE = 4  # one sample in so many enters the gradient's loss: it costs three times the other and needs fewer
 
 
@@ -60,8 +63,7 @@ class Reduced:
 
     name: ClassVar[str] = "reduced"
     rate: ClassVar[float] = 3e-3
-    batch: ClassVar[int] = 128
-    optimizer: ClassVar[type[torch.optim.Optimizer]] = torch.optim.AdamW
+    batch: ClassVar[int] = 256
 
     def __post_init__(self) -> None:
         for name in ("modes", "width", "depth"):
@@ -76,6 +78,13 @@ class Reduced:
     def lesson(self, data: DataSet, train: Samples, validation: Samples) -> ReducedLesson:
         """A `Lesson` with fresh weights."""
         return ReducedLesson(data, train, validation, self)
+
+    def optimizer(self, network: ReducedNetwork, rate: float) -> torch.optim.Optimizer:
+        """Muon for the blocks, AdamW for the layers around them."""
+        hidden = [layer.weight for pair in network.pairs for layer in pair]
+        inside = {id(weight) for weight in hidden}
+        others = [weight for weight in network.parameters() if id(weight) not in inside]
+        return MuonWithAdamW(hidden, others, rate, _WEIGHT_DECAY)
 
     @staticmethod
     def revived(tensors: Mapping[str, Tensor]) -> AveragedNetwork:
@@ -286,7 +295,7 @@ class ReducedLesson(nn.Module):
         elif self.sobolev > 0.0:
             self._store_adjoints(data, train)
         self._store_validation(validation, _corrections(data.response, validation))
-        self._build(train, settings)
+        self._build(settings)
 
     @property
     def sample_count(self) -> int:
@@ -361,13 +370,9 @@ class ReducedLesson(nn.Module):
         network = AveragedNetwork(copy.deepcopy(self.network).cpu().double(), torch.from_numpy(self.basis.turns))
         return network.requires_grad_(False)
 
-    def _build(self, train: Samples, settings: Reduced) -> None:
-        linear = self.response.apply(train.forces).reshape(len(train), -1) @ self.basis.modes
-        importance = _deviation(self.basis.images(linear))
-        # between whitening, which drowns in the small coordinates, and importance, which starves them
+    def _build(self, settings: Reduced) -> None:
         spread = _deviation(self.loads.double().numpy())
-        spread = np.maximum(spread, 1e-3 * spread.max())  # a direction hardly ever loaded must not be blown up
-        scale = (importance / importance.max()) ** 0.25 / spread
+        scale = 1.0 / np.maximum(spread, _LEAST_SPREAD * spread.max())
         size = float(self.targets.square().mean().sqrt())
         self.network = ReducedNetwork(_tensor(scale), size, settings.width, settings.depth)
 

@@ -37,7 +37,6 @@ class Transolver:
     name: ClassVar[str] = "transolver"
     rate: ClassVar[float] = 1e-3
     batch: ClassVar[int] = 16
-    optimizer: ClassVar[type[torch.optim.Optimizer]] = torch.optim.AdamW
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "heads", "slices"):
@@ -52,6 +51,10 @@ class Transolver:
     def lesson(self, data: DataSet, train: Samples, validation: Samples) -> TransolverLesson:
         """A `Lesson` with fresh weights."""
         return TransolverLesson(data, train, validation, self)
+
+    def optimizer(self, network: nn.Module, rate: float) -> torch.optim.Optimizer:
+        """AdamW."""
+        return torch.optim.AdamW(network.parameters(), lr=rate, fused=True)
 
     @staticmethod
     def revived(tensors: Mapping[str, Tensor]) -> TransolverNetwork:

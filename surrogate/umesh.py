@@ -44,7 +44,6 @@ class UMesh:
     name: ClassVar[str] = "umesh"
     rate: ClassVar[float] = 1e-3
     batch: ClassVar[int] = 50
-    optimizer: ClassVar[type[torch.optim.Optimizer]] = torch.optim.Adam
 
     def __post_init__(self) -> None:
         for name in ("channels", "levels"):
@@ -68,6 +67,10 @@ class UMesh:
             ValueError: the body's nodes are not those of a regular grid.
         """
         return UMeshLesson(data, train, validation, self)
+
+    def optimizer(self, network: nn.Module, rate: float) -> torch.optim.Optimizer:
+        """Adam."""
+        return torch.optim.Adam(network.parameters(), lr=rate, fused=True)
 
     @staticmethod
     def revived(tensors: Mapping[str, Tensor]) -> UMeshNetwork:

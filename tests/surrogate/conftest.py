@@ -136,7 +136,7 @@ def make_data(small_beam: Body, tmp_path: Path) -> Maker:
 
 @pytest.fixture(scope="session")
 def small_plan() -> TrainingPlan:
-    return TrainingPlan(Reduced(modes=6, width=32, depth=2), batch=32, epochs=30)
+    return TrainingPlan(Reduced(modes=6, width=32, depth=2), batch=32, epochs=90)
 
 
 @pytest.fixture(scope="session")

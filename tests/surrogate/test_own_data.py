@@ -23,7 +23,7 @@ from softtwin.surrogate.residual import ElasticBody
 from softtwin.surrogate.train import train
 
 COUNT = 160
-PLAN = TrainingPlan(Reduced(modes=6, width=32, depth=2), epochs=150)
+PLAN = TrainingPlan(Reduced(modes=6, width=32, depth=2), epochs=400)
 
 
 @pytest.fixture(scope="module")
