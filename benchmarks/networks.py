@@ -87,6 +87,7 @@ class Row:
         plan: what is trained; None for the baseline without training, a linear map between POD coordinates.
         kind: distribution that it learns from.
         jacobians: whether it learns from whole Jacobians, too.
+        samples: that the baseline without training has; None for all.
     """
 
     table: str
@@ -94,6 +95,7 @@ class Row:
     plan: TrainingPlan | None
     kind: str = "modal"
     jacobians: bool = False
+    samples: int | None = None
 
     @property
     def key(self) -> str:
@@ -177,12 +179,12 @@ class _Nothing(Network):
         return torch.zeros_like(coordinates[:, :1])
 
 
-def linear_map(data: DataSet) -> Surrogate:
+def linear_map(data: DataSet, count: int | None = None) -> Surrogate:
     """The baseline: least squares from forces to the leading POD coordinates of the displacements.
 
     Directions of force that were hardly loaded are left out: how many, the validation samples decide.
     """
-    samples, held = data.samples("train"), data.samples("validation")
+    samples, held = data.samples("train", count), data.samples("validation")
     fields, forces = (array.reshape(len(samples), -1) for array in (samples.displacements, samples.forces))
     truth, loads = (array.reshape(len(held), -1) for array in (held.displacements, held.forces))
     modes = np.linalg.svd(fields, full_matrices=False)[2][:POD_MODES].T
@@ -235,7 +237,7 @@ def run(row: Row, data: dict[str, DataSet], problem: Problem | None, learned: Da
     """Train, on other data than are judged where these are given, and judge one row."""
     began = time.perf_counter()
     own = learned or data[row.kind]
-    surrogate = linear_map(own) if row.plan is None else train(own, row.plan)
+    surrogate = linear_map(own, row.samples) if row.plan is None else train(own, row.plan)
     seconds = time.perf_counter() - began
     figures: dict[str, Any] = {"plan": None if row.plan is None else row.plan.entries(), "learned_from": row.kind}
     figures |= {"training": surrogate.card.get("training"), "samples": surrogate.card.get("samples"), "wall_s": seconds}

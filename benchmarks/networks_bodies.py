@@ -1,6 +1,7 @@
 """Networks on larger bodies: the thesis's liver on a sparse grid (table 4.3), its beam and propeller (table 5.1, 5.2).
 
     python benchmarks/networks_bodies.py [--bodies liver propeller beam] [--ranks 2] [--seconds 300] [--only reduced]
+                                         [--samples 1024]
 
 Makes the data under benchmarks/runs/ where they are not there (under mpirun; goes on where it was stopped). Each row is
 one training, judged on 100 held-out samples, and is written as it is finished; the same command goes on.
@@ -35,6 +36,7 @@ from softtwin.reference.fem.fenicsx import MPI
 from softtwin.reference.generate import Plan, generate
 from softtwin.reference.ranks import on_first
 from softtwin.reference.solve.problem import Problem
+from softtwin.surrogate.architecture import Architecture
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.pod import learned_basis
@@ -127,18 +129,23 @@ def differentiate_all(name: str) -> None:
     differentiate(path, on_first(MPI.COMM_WORLD, modes))
 
 
-def rows(name: str, seconds: float) -> Iterator[Row]:
+def rows(name: str, seconds: float, samples: int | None) -> Iterator[Row]:
     """All networks on one body."""
+
+    def plan(architecture: Architecture) -> TrainingPlan:
+        return TrainingPlan(architecture, seconds=seconds, samples=samples)
+
+    few = "" if samples is None else f", {samples} samples"
     chosen = case(name)
     kinds = {"reduced": Reduced(), f"mlp, width {WIDTH}": Perceptron(WIDTH), "transolver": Transolver()}
     if chosen.channels:
         kinds[f"umesh, {chosen.channels} channels"] = UMesh(chosen.channels)
-    yield Row(chosen.table, f"{name}, POD, linear map", None, name)
+    yield Row(chosen.table, f"{name}, POD, linear map{few}", None, name, samples=samples)
     for label, architecture in kinds.items():
-        yield Row(chosen.table, f"{name}, {label}", TrainingPlan(architecture, seconds=seconds), name)
-    larger = TrainingPlan(Reduced(modes=chosen.modes), seconds=seconds)
-    yield Row(chosen.table, f"{name}, reduced, {chosen.modes} modes", larger, name)
-    yield Row(chosen.table, f"{name}, reduced, {chosen.modes} modes, whole Jacobians", larger, name, jacobians=True)
+        yield Row(chosen.table, f"{name}, {label}{few}", plan(architecture), name)
+    larger = plan(Reduced(modes=chosen.modes))
+    yield Row(chosen.table, f"{name}, reduced, {chosen.modes} modes{few}", larger, name)
+    yield Row(chosen.table, f"{name}, reduced, {chosen.modes} modes, whole Jacobians{few}", larger, name, True)
 
 
 def main() -> None:
@@ -146,6 +153,7 @@ def main() -> None:
     parser.add_argument("--bodies", nargs="+", default=["liver", "propeller", "beam"])
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--samples", type=int, help="learn from the first so many alone")
     parser.add_argument("--only", default="", help="rows that have this in their name")
     parser.add_argument("--name", default=NAME, help="of the record")
     parser.add_argument("--generate", default="", help="make the data of this body alone, and end")
@@ -159,7 +167,7 @@ def main() -> None:
     for name in arguments.bodies:
         data = data_of(name, arguments.ranks)
         with Problem(data.body, data.material, case(name).plan.newton) as problem:
-            for row in rows(name, arguments.seconds):
+            for row in rows(name, arguments.seconds, arguments.samples):
                 if arguments.only not in row.key:
                     continue
                 if row.key not in found:

@@ -16,10 +16,11 @@ from softtwin.reference.data.jacobians import mark
 from .plan import TrainingPlan
 
 CHECKPOINT = "training.ckpt"
+VERSION = 2  # of how training goes on: raised where another optimizer or its usual settings would
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that training cannot go on from: truncated, or of another plan or data set."""
+    """A checkpoint that training cannot go on from: truncated, or of another version, plan or data set."""
 
 
 def fingerprint(data: DataSet, splits: Mapping[str, Samples]) -> str:
@@ -43,7 +44,7 @@ def read_checkpoint(path: Path, plan: TrainingPlan, mark: str) -> dict[str, Any]
         mark: fingerprint of the data that it must belong to.
 
     Raises:
-        CheckpointError: it is truncated, or of another plan or data set.
+        CheckpointError: it is truncated, or of another version of this program, plan or data set.
     """
     try:
         course: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)["course"]
@@ -54,6 +55,11 @@ def read_checkpoint(path: Path, plan: TrainingPlan, mark: str) -> dict[str, Any]
             f"train.folder: {path} cannot be read ({type(error).__name__}); it is truncated or no checkpoint of "
             "this program. Delete it to train from the start."
         ) from error
+    if course.get("version", 1) != VERSION:
+        raise CheckpointError(
+            f"train.folder: {path} is of another version of this program, which trains in another way; choose another "
+            "folder, or train from the start (`softtwin train --fresh`)."
+        )
     wanted = plan.entries()
     differing = [name for name in wanted if course["plan"].get(name) != wanted[name]]
     if differing:

@@ -24,6 +24,7 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 from tqdm import tqdm
 
+from .checkpoint import VERSION
 from .plan import TrainingPlan
 
 ROUNDS = 40  # a round ends with a look at the validation split and a checkpoint
@@ -220,6 +221,7 @@ class Course(lightning.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what Lightning does not know of."""
         checkpoint["course"] = {
+            "version": VERSION,
             "plan": self.plan.entries(),
             "data": self.mark,
             "steps_made": self.steps_made,

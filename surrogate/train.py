@@ -39,7 +39,7 @@ def train(
         clock: seconds since whenever; `plan.seconds` is measured with it.
 
     Raises:
-        CheckpointError: the folder's checkpoint is truncated, or of another plan or data set.
+        CheckpointError: the folder's checkpoint is truncated, or of another version, plan or data set.
         DataSetError: the training or validation split is not complete.
         Diverged: the validation error is no finite number any more.
         ValueError: a GPU is asked for and there is none; a split holds no accepted sample, or numbers that are not

@@ -44,7 +44,7 @@ def train_stage(space: Workspace, fresh: bool = False, device: Device = "auto", 
         ConfigError: there is no body, or one of another configuration; another `train` is at work there; Jacobians are
             wanted that are not there.
         DataSetError: the data set is missing, damaged, not complete, or of another body or configuration.
-        CheckpointError: the checkpoint is truncated, or of another plan or data set.
+        CheckpointError: the checkpoint is truncated, or of another version, plan or data set.
     """
     data, _ = current_data(space)
     if lacks_jacobians(space.config, data):

@@ -271,6 +271,15 @@ def test_a_checkpoint_of_another_plan_is_refused(data: DataSet, short: TrainingP
         train(data, replace(short, architecture=Reduced(modes=6, width=16, depth=2), seed=3), tmp_path)
 
 
+def test_a_checkpoint_of_another_version_is_refused(data: DataSet, short: TrainingPlan, tmp_path: Path) -> None:
+    train(data, short, tmp_path)
+    checkpoint = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    checkpoint["course"]["version"] = 1
+    torch.save(checkpoint, tmp_path / CHECKPOINT)
+    with pytest.raises(CheckpointError, match="another version"):
+        train(data, short, tmp_path)
+
+
 def test_a_checkpoint_of_another_data_set_is_refused(
     data: DataSet, make_data: Any, short: TrainingPlan, tmp_path: Path
 ) -> None:
