@@ -253,7 +253,12 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
     "--displacement", type=float, default=0.05, show_default=True, help="Largest displacement to learn, metres."
 )
 @click.option("--samples", type=int, default=512, show_default=True, help="Equilibria to learn from.")
-@click.option("--jacobians", is_flag=True, help="Learn from the Jacobians of the equilibria too (takes longer).")
+@click.option(
+    "--jacobians/--no-jacobians",
+    default=True,
+    show_default=True,
+    help="Learn from the Jacobians of the equilibria too.",
+)
 @click.option(
     "--ramp", type=int, default=1, show_default=True, help="Draws that share a load at growing sizes (cheaper)."
 )

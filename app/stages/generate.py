@@ -53,7 +53,7 @@ def generate_stage(configuration: Path, redo: Sequence[int] = (), again: bool = 
     plan = plan_from_header({"plan": plan_entries(space.config)})
     data = generate(space.data, body, plan, comm, redo, again)
     assert data is not None
-    if comm.bcast(space.config.samples.jacobians, root=0):
+    if comm.bcast(space.config.wants_jacobians, root=0):
         modes = on_first(comm, lambda: jacobian_modes(space.config, data))
         differentiate(space.data, modes, comm)
     record_stage(space, "generate", time.perf_counter() - begin, generate_inputs(space, body))
@@ -69,7 +69,7 @@ def jacobian_modes(config: Config, data: DataSet) -> Floats:
 
 def lacks_jacobians(config: Config, data: DataSet) -> bool:
     """Whether Jacobians are wanted that are not there, or not all, or of other modes."""
-    if not config.samples.jacobians:
+    if not config.wants_jacobians:
         return False
     modes = stored_modes(data)
     if modes is None or missing_jacobians(data):

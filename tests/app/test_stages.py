@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -394,20 +395,22 @@ def test_a_twin_on_a_regular_grid_registers_clouds_of_the_surface(capsys, tmp_pa
     run(capsys, "validate", out / "organ.toml")
 
 
-def test_jacobians_are_made_where_they_are_wanted(copy: Path) -> None:
-    wanted = {"samples": {"jacobians": True}}
-    weights = (copy / "twin" / "surrogate.safetensors").read_bytes()
-    said = build(copy, **wanted)
+def test_jacobians_are_made_where_they_are_wanted(tmp_path: Path) -> None:
+    write_files(tmp_path, bar())
+    build(tmp_path, samples={"jacobians": False})
+    assert stored_modes(DataSet(tmp_path / "data.zarr")) is None
+    weights = (tmp_path / "twin" / "surrogate.safetensors").read_bytes()
+    said = build(tmp_path)
     assert "there already" not in said and "from the start" in said
-    modes = stored_modes(DataSet(copy / "data.zarr"))
+    modes = stored_modes(DataSet(tmp_path / "data.zarr"))
     assert modes is not None and modes.shape[1] == 4
-    assert (copy / "twin" / "surrogate.safetensors").read_bytes() != weights
-    assert "there already: 10 equilibria accepted, 0 rejected, Jacobians of 4 modes" in build(copy, **wanted)
-    edit(copy, "modes = 4 # displacement modes", "modes = 3 # displacement modes")
+    assert (tmp_path / "twin" / "surrogate.safetensors").read_bytes() != weights
+    assert "there already: 10 equilibria accepted, 0 rejected, Jacobians of 4 modes" in build(tmp_path)
+    edit(tmp_path, "modes = 4 # displacement modes", "modes = 3 # displacement modes")
     with pytest.raises(ConfigError, match=r"samples\.jacobians: .* of other modes .* run `softtwin generate` again"):
-        train_stage(open_workspace(copy / "organ.toml"), fresh=True)
-    build(copy, **wanted, training={"modes": 3})
-    assert stored_modes(DataSet(copy / "data.zarr")).shape[1] == 3
+        train_stage(open_workspace(tmp_path / "organ.toml"), fresh=True)
+    build(tmp_path, training={"modes": 3})
+    assert stored_modes(DataSet(tmp_path / "data.zarr")).shape[1] == 3
 
 
 def test_a_grid_as_coarse_as_the_organ_is_refused(tmp_path: Path) -> None:
@@ -423,6 +426,14 @@ def test_a_body_that_the_network_cannot_learn_on_is_refused_before_anything_is_s
     assert not (tmp_path / "data.zarr").exists()
 
 
-def test_jacobians_for_a_network_that_reads_none_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"samples\.jacobians: expected the architecture reduced"):
-        config(samples={"jacobians": True}, training={"architecture": "mlp", "modes": 64, "width": 256})
+@pytest.mark.parametrize(
+    ("samples", "training", "wanted"),
+    [
+        ({}, {}, True),
+        ({"jacobians": False}, {}, False),
+        ({}, {"architecture": "mlp", "modes": 64, "width": 256}, False),
+        ({}, {"settings": {"sobolev": 0.0}}, False),
+    ],
+)
+def test_jacobians_are_wanted_where_the_network_learns_from_them(samples: Any, training: Any, wanted: bool) -> None:
+    assert config(samples=samples, training=training).wants_jacobians is wanted
