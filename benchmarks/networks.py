@@ -59,12 +59,12 @@ CHANNELS, FEW = 16, 2048  # of U-Mesh, and its samples, on two cores; the thesis
 EPOCHS = 100  # of the thesis
 
 
-def data_of(kind: str, counts: dict[str, int], ranks: int, jacobians: bool = False) -> DataSet:
+def data_of(kind: str, counts: dict[str, int], ranks: int, seed: int = 0, jacobians: bool = False) -> DataSet:
     """The beam under modal or random loads, with Jacobians in a folder of its own; what is there is not made again."""
-    plain = RUNS / f"beam-{kind}-{counts['train']}"
+    plain = RUNS / f"beam-{kind}-{counts['train']}{f'-seed-{seed}' if seed else ''}"
     folder = plain.with_name(f"{plain.name}-jacobians") if jacobians else plain
     loads = {"kind": kind, "amplitude": AMPLITUDES[kind], "patches": 1, "radius": (0.055, 0.64)}
-    samples = {**counts, "block": 16, "ranks": ranks, "jacobians": jacobians}
+    samples = {**counts, "block": 16, "ranks": ranks, "seed": seed, "jacobians": jacobians}
     made = existing(folder / "data.zarr")
     if made is not None and not made.missing_blocks() and not (jacobians and missing_jacobians(made)):
         return made
@@ -269,6 +269,7 @@ def main() -> None:
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--train", type=int, default=8192)
     parser.add_argument("--seconds", type=float, default=200.0)
+    parser.add_argument("--data-seed", type=int, default=0, help="other data, that nothing was chosen on")
     parser.add_argument("--own-alone", action="store_true", help="leave the other distribution out")
     parser.add_argument("--data", type=Path, help="modal data that are there, where FEniCSx is not")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"], help="of the table thesis")
@@ -279,10 +280,11 @@ def main() -> None:
     arguments = parser.parse_args()
     held_out = {"validation": 256, "test": 512}
     counts = {"train": arguments.train, **held_out}
-    data = {"modal": DataSet(arguments.data) if arguments.data else data_of("modal", counts, arguments.ranks)}
+    ranks, seed = arguments.ranks, arguments.data_seed
+    data = {"modal": DataSet(arguments.data) if arguments.data else data_of("modal", counts, ranks, seed)}
     if not arguments.own_alone and not arguments.data:
         count = arguments.train if "4.1" in arguments.tables else 16
-        data["random"] = data_of("random", {"train": count, **held_out}, arguments.ranks)
+        data["random"] = data_of("random", {"train": count, **held_out}, ranks, seed)
     path = RESULTS / f"{arguments.name}.json"
     found = json.loads(path.read_text())["figures"] if path.exists() else {}
     with reference(data["modal"]) as problem:
@@ -293,11 +295,12 @@ def main() -> None:
         for row in wanted:
             if arguments.only not in row.key:
                 continue
-            if row.key not in found:
-                learned = data_of("modal", counts, arguments.ranks, True) if row.jacobians else None
-                found[row.key] = run(row, data, problem, learned)
+            key = f"{row.key}, data {seed}" if seed else row.key
+            if key not in found:
+                learned = data_of("modal", counts, ranks, seed, True) if row.jacobians else None
+                found[key] = run(row, data, problem, learned)
                 write(path.stem, found)
-            show(row.key, found[row.key])
+            show(key, found[key])
 
 
 if __name__ == "__main__":
