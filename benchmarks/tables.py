@@ -133,6 +133,7 @@ def main() -> None:
     sequences("registration_reference_default_facets")
     sequences("registration_surrogate")
     networks("networks")
+    networks("networks_samples")
     networks("networks_physics")
     networks("networks_bodies")
 
