@@ -143,6 +143,8 @@ def rows(tables: list[str], train_count: int, seconds: float) -> Iterator[Row]:
             for name in ("reduced", "mlp"):
                 plan = TrainingPlan(kinds[name][0], seconds=seconds, samples=count)
                 yield Row("samples", f"{name}, {count} samples", plan)
+            plan = TrainingPlan(Reduced(), seconds=seconds, samples=count)
+            yield Row("samples", f"reduced, whole Jacobians, {count} samples", plan, jacobians=True)
             count *= 2
 
 
