@@ -52,6 +52,7 @@ class Equilibrium:
         trace: every iteration, where asked for.
         local_iterations: Newton iterations of a few cells alone (nonlinear elimination).
         load: what is in balance; its following pressures belong to the tangent.
+        start: where Newton's method came from: `guess`, `proposal`, `linear response`, `rest` or `load steps`.
     """
 
     displacement: Floats
@@ -66,6 +67,7 @@ class Equilibrium:
     trace: tuple[Iteration, ...] = ()
     local_iterations: int = 0
     load: Loading = field(default_factory=Loading)
+    start: str = ""
 
     @property
     def is_stable(self) -> bool:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.meshes.body import Body
 
 from ..data.loading import Loading, checked_array
-from ..data.materials import Material
+from ..data.materials import MATERIALS, Material
 from ..data.outcome import Equilibrium
 from ..solve.problem import Problem
 
@@ -27,8 +28,23 @@ class Start(Protocol):
         """Of the nodes, (n, 3), metres."""
 
 
+class Predictor(Protocol):
+    """What says where an equilibrium is likely to be, as far as a search starts there: a surrogate."""
+
+    @property
+    def body(self) -> Body:
+        """The body that it knows."""
+
+    @property
+    def learned_material(self) -> Mapping[str, Any] | None:
+        """`material`, `young_modulus`, `poisson_ratio` that it has learned; None where that is not known."""
+
+    def propose(self, forces: ArrayLike) -> Floats:
+        """The displacement, (n, 3), metres, that is thought to balance nodal forces, (n, 3), newtons."""
+
+
 class ReferenceModel:
-    """Forces to equilibrium by finite elements.
+    """Forces to equilibrium by finite elements, from where a network says if there is one (hybrid Newton).
 
     It remembers no state: what a solve found is the value that it returns.
 
@@ -37,10 +53,26 @@ class ReferenceModel:
         patient: try every other way where the state to start from is too far; False refuses at once, for a search that
             can shorten its step.
         loading: what acts beside the nodal forces at all times (weight, pressures, prescribed displacements).
+        predictor: proposes where to start when no neighbour is given. Its proposal is weighed against the warped linear
+            response, Newton's method goes on from the better one to the same tolerance, and a state that is no minimum
+            is not taken: a poor network costs the time of its prediction and changes nothing (after Odot 2023,
+            algorithm 5, which compares residuals).
+
+    Raises:
+        ValueError: a predictor of another body or material.
     """
 
-    def __init__(self, problem: Problem, patient: bool = True, loading: Loading | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        patient: bool = True,
+        loading: Loading | None = None,
+        predictor: Predictor | None = None,
+    ) -> None:
         self.problem, self.patient, self.loading = problem, patient, loading or Loading()
+        self.predictor = predictor
+        if predictor is not None:
+            _check_predictor(predictor, problem)
 
     @property
     def body(self) -> Body:
@@ -63,7 +95,7 @@ class ReferenceModel:
             forces: nodal forces.
             near: a state to start from. The neighbour of one of this model's is wanted: it is first moved along its
                 tangent by the change of the forces. Another model's is a proposal, which is weighed against the
-                warped linear response. That response alone if not given.
+                warped linear response. If not given, the predictor's proposal, or that response alone.
 
         Raises:
             NotConverged: no equilibrium was found; states that were found before stay as they are.
@@ -73,11 +105,41 @@ class ReferenceModel:
         fixed = self.loading.forces
         load = replace(self.loading, forces=given if fixed is None else given + np.asarray(fixed))
         guess = near.equilibrium if isinstance(near, ReferenceState) else None
-        proposal = None if near is None or guess is not None else near.displacement
+        proposal = self._proposal(given) if near is None else near.displacement if guess is None else None
         found = self.problem.solve(
             load, guess, proposal=proposal, stability=False, fallback=self.patient or guess is None
         )
         return ReferenceState(given, found, self, self.problem.material)
+
+    def _proposal(self, forces: Floats) -> Floats | None:
+        """What the predictor says, if anything that one could start from."""
+        if self.predictor is None:
+            return None
+        try:
+            proposal = self.predictor.propose(forces)
+        except ValueError:  # forces where it has never seen any
+            return None
+        return proposal if np.isfinite(proposal).all() else None
+
+
+def _check_predictor(predictor: Predictor, problem: Problem) -> None:
+    if predictor.body.fingerprint != problem.body.fingerprint:
+        raise ValueError(
+            f"ReferenceModel.predictor: expected a network of this body (fingerprint "
+            f"{problem.body.fingerprint[:12]}...), got one of another ({predictor.body.fingerprint[:12]}...)."
+        )
+    learned = predictor.learned_material
+    if learned is None:
+        return
+    expected = MATERIALS.get(learned["material"])
+    theirs = {name: learned[name] for name in ("young_modulus", "poisson_ratio")}
+    here = problem.material
+    same = isinstance(here, expected) if expected is not None else False
+    if not same or any(np.any(getattr(here, name, None) != value) for name, value in theirs.items()):
+        raise ValueError(
+            f"ReferenceModel.predictor: expected a network of {here!r}, got one that has learned "
+            f"{learned['material']} with {theirs}; its proposals would lie elsewhere."
+        )
 
 
 @dataclass(frozen=True, eq=False)

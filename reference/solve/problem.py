@@ -145,7 +145,8 @@ class Problem:
             guess: displacement whose neighbour is wanted, (n, 3), metres, or another equilibrium, which is first moved
                 along its tangent by the change of the load; the warped linear response if not given.
             proposal: displacement that is thought to be near this load's equilibrium, a network's answer for instance,
-                (n, 3), metres. It stands beside the warped response: the one of less energy is tried first.
+                (n, 3), metres. It stands beside the warped response: the one of less energy is tried first. Where the
+                proposal leads to a state that is no minimum, the others are tried, too.
             stability: also factor the tangent at the state and count its negative pivots.
             fallback: try the other ways where the guess fails; without, a failure there (and from the warped linear
                 response, where an equilibrium is too far) is raised at once.
@@ -162,9 +163,9 @@ class Problem:
             for start in self._starts.candidates(wanted, guess, proposal, fallback):
                 attempt = self._newton.run(wanted, start.unknowns, eliminate=start.may_leave)
                 spent += attempt.iterations
-                if attempt.converged:
+                if attempt.converged and (start.name != "proposal" or self._is_lowest(attempt, wanted)):
                     found = replace(attempt, iterations=spent)
-                    return self._result(found, given, wanted, load_steps=1, stability=stability, trace=trace)
+                    return self._result(found, given, wanted, 1, start.name, stability=stability, trace=trace)
             if not fallback:
                 raise NotConverged(
                     f"Problem.solve: no equilibrium near the guess ({attempt.reason_name} after {spent} iterations). "
@@ -172,6 +173,16 @@ class Problem:
                     trace=tuple(self._newton.trace),
                 )
         return self._solve_in_steps(given, wanted, spent, stability, trace)
+
+    def _is_lowest(self, attempt: Attempt, load: DiscreteLoad) -> bool:
+        """Whether the energy is least where a stranger's proposal led: by the last tangent on the way, or the state's.
+
+        True where nobody knows.
+        """
+        tangent = self.system.tangent
+        if tangent.factorisations and tangent.linear.negative_pivots() == 0:
+            return True
+        return not tangent.negative_pivots(attempt.unknowns, load)
 
     def _solve_in_steps(
         self, given: Loading, load: DiscreteLoad, spent: int, stability: bool, trace: bool
@@ -181,12 +192,12 @@ class Problem:
         spent += found.iterations
         if found.last is not None and found.reached == 1.0:
             whole = replace(found.last, iterations=spent)
-            return self._result(whole, given, load, found.load_steps, stability, trace)
+            return self._result(whole, given, load, found.load_steps, "load steps", stability, trace)
         lines = tuple(self._newton.trace)
         last = None
         if found.last is not None:
             part = given.scaled(found.reached), load.scaled(found.reached)
-            last = self._result(found.last, *part, found.load_steps, True, False)
+            last = self._result(found.last, *part, found.load_steps, "load steps", True, False)
         advice = (
             "No more load can be added there: a limit point, or a mesh too coarse for it. Try a smaller load, a finer "
             "mesh, or displacements prescribed instead of forces."
@@ -203,7 +214,14 @@ class Problem:
         )
 
     def _result(
-        self, attempt: Attempt, given: Loading, load: DiscreteLoad, load_steps: int, stability: bool, trace: bool
+        self,
+        attempt: Attempt,
+        given: Loading,
+        load: DiscreteLoad,
+        load_steps: int,
+        start: str,
+        stability: bool,
+        trace: bool,
     ) -> Equilibrium:
         unknowns, forms, tangent = attempt.unknowns, self.system.forms, self.system.tangent
         energy = forms.potential(unknowns, load) + forms.pressure_potential(unknowns, load)
@@ -221,6 +239,7 @@ class Problem:
             trace=tuple(self._newton.trace) if trace else (),
             local_iterations=self._newton.local_iterations,
             load=given,
+            start=start,
         )
 
     # ------------------------------------------------------------------ the tangent at a state

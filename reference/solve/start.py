@@ -27,12 +27,14 @@ class Start:
 
     Args:
         unknowns: this rank's.
+        name: where it comes from: `guess`, `proposal`, `linear response` (warped) or `rest`.
         may_leave: whether another equilibrium than the nearest may be found from here: then a few cells may be balanced
             alone on the way.
     """
 
     unknowns: Floats
-    may_leave: bool
+    name: str
+    may_leave: bool = True
 
 
 class Starts:
@@ -68,20 +70,19 @@ class Starts:
         """
         near, is_trusted = (None, False) if guess is None else self._near(guess, load)
         if near is not None and is_trusted:
-            yield Start(near, may_leave=False)
+            yield Start(near, "guess", may_leave=False)
             if not fallback:
                 return
-        starts = [self._first_guess(load)]
+        starts = [Start(self._first_guess(load), "linear response")]
         if near is not None and not is_trusted:
-            starts.append(near)
+            starts.append(Start(near, "guess"))
         if proposal is not None:
-            starts.append(self._lifted(proposal, load, "proposal"))
+            starts.append(Start(self._lifted(proposal, load, "proposal"), "proposal"))
         if len(starts) > 1:
-            starts.sort(key=lambda start: self._merit(start, load))
-        for start in starts:
-            yield Start(start, may_leave=True)
+            starts.sort(key=lambda start: self._merit(start.unknowns, load))
+        yield from starts
         if fallback and not self._has_lift(load):
-            yield Start(np.zeros_like(load.dead), may_leave=True)
+            yield Start(np.zeros_like(load.dead), "rest")
 
     def _lifted(self, state: ArrayLike | Equilibrium, load: DiscreteLoad, name: str) -> Floats:
         """A state with its held unknowns where the load wants them."""

@@ -1,4 +1,4 @@
-"""One suite over all forward models: the reference and both surrogates, trained on equilibria of the same beam.
+"""One suite over all forward models: the reference, from rest and from a network, and two networks, of the same beam.
 
 The thesis's perceptron is the yardstick: it vanishes nowhere by construction and has kinks between its linear pieces.
 Tests of what it cannot do name the models that they are for.
@@ -28,7 +28,7 @@ from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
 
 pytestmark = pytest.mark.fenicsx
-ALL, EXACT = ("reference", "reduced", "mlp"), ("reference", "reduced")
+ALL, EXACT = ("reference", "hybrid", "reduced", "mlp"), ("reference", "hybrid", "reduced")
 PLAN = Plan(loads=LoadPlan(modes=6, displacement=0.1), samples={"train": 32, "validation": 4, "test": 4}, block=4)
 
 
@@ -44,11 +44,12 @@ _NETWORKS = {"reduced": Reduced(modes=16, width=32), "mlp": Perceptron()}
 
 @pytest.fixture(scope="module", params=ALL)
 def model(request: pytest.FixtureRequest, data: DataSet) -> Iterator[ForwardModel]:
-    if request.param != "reference":
+    if request.param in _NETWORKS:
         yield train(data, TrainingPlan(_NETWORKS[request.param], epochs=40))
         return
+    predictor = train(data, TrainingPlan(_NETWORKS["reduced"], epochs=40)) if request.param == "hybrid" else None
     with Problem(data.body, PLAN.build_material(), NewtonOptions(tolerance=1e-11)) as problem:
-        yield ReferenceModel(problem)
+        yield ReferenceModel(problem, predictor=predictor)
 
 
 exact = pytest.mark.parametrize("model", EXACT, indirect=True)  # zero where it has to be, smooth everywhere

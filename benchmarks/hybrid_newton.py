@@ -1,0 +1,265 @@
+"""Newton's method from a network's prediction (thesis, table 5.3): shares, iterations, factorisations, times, states.
+
+    python benchmarks/hybrid_newton.py [--bodies small large] [--seconds 300] [--only ours]
+
+Half of the loads are drawn like those that were learned (and are none of them), half are up to twice as large. A
+failure counts at the time it took. Every state found is compared with the one that 20 load steps lead to from rest. Each row is
+written as it is finished; the same command goes on. Data and networks are made under benchmarks/runs/ where they are
+not there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from networks import RUNS
+from networks import data_of as small_data
+from networks_bodies import case
+from networks_bodies import data_of as body_data
+from numpy.typing import NDArray
+from record import RESULTS, write
+from threadpoolctl import threadpool_limits
+
+from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.derivatives.model import ReferenceModel
+from softtwin.reference.generate import Plan, plan_from_header, ramp_loads
+from softtwin.reference.solve.problem import Problem
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.train import train
+from softtwin.surrogate.twin import load as load_twin
+from softtwin.surrogate.twin import save
+
+Floats = NDArray[np.float64]
+NAME = "hybrid_newton"
+COUNTS = {"small": 1000, "large": 100}
+FRESH = 1_000_000  # numbers of loads begin here: none of them is in a data set
+RANGES = ("in range", "up to twice")
+STEPS, MOST = 20, 60
+SAME = 1e-4  # of the largest displacement: a state that is farther away is another one
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a way of solving made of one load.
+
+    Args:
+        displacement: None where it failed.
+        seconds: that it took, or took to fail.
+        iterations: of Newton's method.
+        factorisations: tangents factored.
+        picked: whether it went on from the prediction.
+    """
+
+    displacement: Floats | None
+    seconds: float
+    iterations: int = 0
+    factorisations: int = 0
+    picked: bool = False
+
+
+Way = Callable[[Floats], Found]
+
+
+def reference_way(problem: Problem, network: Surrogate | None) -> Way:
+    """Softtwin's own solver, from a network or without."""
+    model = ReferenceModel(problem, predictor=network)
+
+    def solve(load: Floats) -> Found:
+        began = time.perf_counter()
+        try:
+            state = model.solve(load).equilibrium
+        except NotConverged:
+            return Found(None, time.perf_counter() - began)
+        seconds = time.perf_counter() - began
+        return Found(state.displacement, seconds, state.iterations, state.factorisations, state.start == "proposal")
+
+    return solve
+
+
+def printed_way(problem: Problem, network: Surrogate | None) -> Way:
+    """Algorithm 5 as printed, but for its inverted condition to go on; without a network algorithm 4, full steps."""
+    system = problem.system
+
+    def solve(load: Floats) -> Found:
+        began = time.perf_counter()
+        wanted = system.load(load)[1]
+        enough = problem.options.tolerance * float(np.linalg.norm(wanted.dead))
+        unknowns, picked = np.zeros_like(wanted.dead), False
+
+        def residual(at: Floats) -> Floats:
+            gap = system.forms.residual(at, wanted)
+            gap[system.space.fixed] = 0.0
+            return np.asarray(gap)
+
+        if network is not None:
+            predicted = system.unknowns(network.solve(load).displacement)
+            predicted[system.space.fixed] = 0.0
+            size = np.linalg.norm(residual(predicted))
+            if size < enough:
+                return Found(system.space.field(predicted), time.perf_counter() - began, picked=True)
+        gap = residual(unknowns)
+        for iteration in range(1, MOST + 1):
+            try:
+                step = system.tangent.solve(unknowns, wanted, gap[None])[0]
+            except RuntimeError:  # a singular tangent
+                break
+            unknowns = unknowns - step
+            gap = residual(unknowns)
+            if network is not None and iteration == 1 and not np.linalg.norm(gap) <= size:
+                unknowns, gap, picked = predicted, residual(predicted), True
+            norm = np.linalg.norm(gap)
+            if not np.isfinite(norm):
+                break
+            if norm < enough:
+                seconds = time.perf_counter() - began
+                return Found(system.space.field(unknowns), seconds, iteration, iteration, picked)
+        return Found(None, time.perf_counter() - began, iteration, iteration, picked)
+
+    return solve
+
+
+def stepped_way(problem: Problem) -> Way:
+    """As many equal load steps, each from the one before: the state that every other way is held against."""
+
+    def solve(load: Floats) -> Found:
+        began, state, iterations, factorisations = time.perf_counter(), None, 0, 0
+        try:
+            for part in np.linspace(0.0, 1.0, STEPS + 1)[1:]:
+                state = problem.solve(part * load, state, stability=False)
+                iterations, factorisations = iterations + state.iterations, factorisations + state.factorisations
+        except NotConverged:
+            return Found(None, time.perf_counter() - began, iterations, factorisations)
+        assert state is not None
+        return Found(state.displacement, time.perf_counter() - began, iterations, factorisations)
+
+    return solve
+
+
+def without_training(network: Surrogate) -> Surrogate:
+    """The same network with random weights of the same sizes."""
+    generator = torch.Generator().manual_seed(0)
+    other = Surrogate(network.body, network.maps, copy.deepcopy(network.network), network.card)
+    for weights in other.network.parameters():
+        noise = torch.randn(weights.shape, generator=generator, dtype=weights.dtype)
+        weights.data = weights.std(correction=0) * noise
+    return other
+
+
+def data_of(body: str, ranks: int) -> DataSet:
+    """Equilibria with whole Jacobians to learn from."""
+    if body == "small":
+        return small_data("modal", {"train": 8192, "validation": 256, "test": 512}, ranks, jacobians=True)
+    return body_data("beam", ranks, jacobians=True)
+
+
+def network_of(body: str, data: DataSet, seconds: float) -> Surrogate:
+    """The reduced network of a body, trained once."""
+    folder = RUNS / f"hybrid-{body}-{seconds:g}s"
+    if not (folder / "surrogate.json").exists():
+        modes = Reduced().modes if body == "small" else case("beam").modes
+        save(train(data, TrainingPlan(Reduced(modes=modes), seconds=seconds)), folder)
+    return load_twin(folder, data.body)
+
+
+def loads_of(data: DataSet, plan: Plan, count: int) -> dict[str, Floats]:
+    """Fresh loads, (count, n, 3), newtons: half in the range of those learned, half up to twice."""
+    chance = np.random.default_rng([plan.seed, 5])
+    tops = np.stack([ramp_loads(data, replace(plan, ramp=1), FRESH + i)[0] for i in range(count)])
+    inside = np.ones(count // 2) if plan.loads.amplitude is not None else chance.uniform(0.0, 1.0, count // 2)
+    sizes = inside, chance.uniform(1.0, 2.0, count - count // 2)
+    parts = tops[: count // 2], tops[count // 2 :]
+    return {name: part * size[:, None, None] for name, part, size in zip(RANGES, parts, sizes, strict=True)}
+
+
+def figures_of(found: list[Found], truth: list[Floats | None]) -> dict[str, Any]:
+    """Of one way over the loads of one range; means are over all loads, failures at the time they took."""
+    milliseconds = 1e3 * np.array([each.seconds for each in found])
+    converged = [each for each in found if each.displacement is not None]
+    compared = [(a.displacement, b) for a, b in zip(found, truth, strict=True) if b is not None]
+    same = sum(a is not None and bool(np.abs(a - b).max() <= SAME * np.abs(b).max()) for a, b in compared)
+    alone = sum(a.displacement is not None and b is None for a, b in zip(found, truth, strict=True))
+    return {
+        "loads": len(found),
+        "converged": len(converged),
+        "same_state": same,
+        "compared": len(compared),
+        "where_load_steps_failed": alone,
+        "picked": sum(each.picked for each in found),
+        "iterations": float(np.mean([each.iterations for each in converged])) if converged else None,
+        "factorisations": float(np.mean([each.factorisations for each in converged])) if converged else None,
+        "median_ms": float(np.median(milliseconds)),
+        "mean_ms": float(milliseconds.mean()),
+        "p95_ms": float(np.percentile(milliseconds, 95)),
+    }
+
+
+def truth_of(body: str, problem: Problem, loads: dict[str, Floats], again: bool) -> tuple[dict[str, list[Any]], Any]:
+    """States that load steps lead to, kept from run to run, and the figures of that way."""
+    path = RUNS / f"hybrid-{body}-truth.npz"
+    kept = path.with_suffix(".json")
+    if again or not kept.exists():
+        solve, states, figures = stepped_way(problem), {}, {}
+        for name, part in loads.items():
+            found = [solve(load) for load in part]
+            empty = np.full_like(part[0], np.nan)
+            states[name] = np.stack([empty if each.displacement is None else each.displacement for each in found])
+            figures[name] = figures_of(found, [each.displacement for each in found])
+        np.savez(path, **states)
+        kept.write_text(json.dumps(figures))
+    with np.load(path) as stored:
+        truth = {name: [None if np.isnan(each).any() else each for each in stored[name]] for name in loads}
+    return truth, json.loads(kept.read_text())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--bodies", nargs="+", default=["small", "large"], choices=list(COUNTS))
+    parser.add_argument("--seconds", type=float, default=300.0, help="of training")
+    parser.add_argument("--ranks", type=int, default=2)
+    parser.add_argument("--count", type=int, help="of loads, in place of 1,000 and 100")
+    parser.add_argument("--only", default="", help="rows that have this in their name")
+    parser.add_argument("--name", default=NAME, help="of the record")
+    arguments = parser.parse_args()
+    path = Path(RESULTS / f"{arguments.name}.json")
+    found = json.loads(path.read_text())["figures"] if path.exists() else {}
+    for body in arguments.bodies:
+        data = data_of(body, arguments.ranks)
+        plan = plan_from_header(data.header)
+        network = network_of(body, data, arguments.seconds)
+        loads = loads_of(data, plan, arguments.count or COUNTS[body])
+        with threadpool_limits(1), Problem(data.body, plan.build_material()) as problem:
+            truth, stepped = truth_of(body, problem, loads, arguments.count is not None)
+            ways = {
+                "full steps from rest (algorithm 4)": printed_way(problem, None),
+                "algorithm 5 as printed": printed_way(problem, network),
+                "cold": reference_way(problem, None),
+                "ours": reference_way(problem, network),
+                "ours, random weights": reference_way(problem, without_training(network)),
+            }
+            for name in RANGES:
+                found[f"{body}, {name}: {STEPS} load steps"] = stepped[name]
+            for label, solve in ways.items():
+                for name in RANGES:
+                    key = f"{body}, {name}: {label}"
+                    if key in found or arguments.only not in key:
+                        continue
+                    solve(loads[name][0])  # what is factored once
+                    found[key] = figures_of([solve(load) for load in loads[name]], truth[name])
+                    write(path.stem, found)
+                    print(key, found[key], flush=True)
+
+
+if __name__ == "__main__":
+    main()
