@@ -315,6 +315,7 @@ def build(
             "train": given["samples"],
             "validation": max(8, given["samples"] // 8),
             "test": max(8, given["samples"] // 4),
+            "calibration": max(12, given["samples"] // 4),
             "ranks": given["ranks"],
             "ramp": given["ramp"],
             "jacobians": given["jacobians"],

@@ -111,6 +111,11 @@ class SamplesSection(_Section):
     train: Count = Field(512, description="draws to learn from")
     validation: Count = Field(64, description="draws to choose the best weights with")
     test: Count = Field(128, description="draws held out, never seen in training")
+    calibration: int = Field(
+        0,
+        ge=0,
+        description="draws to calibrate bounds on errors with, neither learned nor chosen from; 0: no bounds",
+    )
     block: Count = Field(8, description="draws in one block of work")
     ramp: Count = Field(
         1,

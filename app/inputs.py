@@ -44,7 +44,10 @@ def plan_entries(config: Config) -> dict[str, Any]:
     return {
         **{word: getattr(config.material, name) for name, word in _MATERIAL.items()},
         "loads": loads,
-        "samples": {"train": samples.train, "validation": samples.validation, "test": samples.test},
+        "samples": {
+            **{"train": samples.train, "validation": samples.validation, "test": samples.test},
+            **({"calibration": samples.calibration} if samples.calibration else {}),
+        },
         "block": samples.block,
         "ramp": samples.ramp,
         "seed": samples.seed,

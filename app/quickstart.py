@@ -39,13 +39,13 @@ def quickstart_config(small: bool) -> Config:
     """The configuration of the quickstart; `small` goes the same way with less of everything."""
     loads = {"displacement": 0.03, "patches": 2, "radius": (0.15, 0.5)}
     if small:
-        samples = {"train": 24, "validation": 8, "test": 8, "block": 4}
+        samples = {"train": 24, "validation": 8, "test": 8, "calibration": 12, "block": 4}
         body = {"source": "liver-phantom", "cell_size": 0.016}
         return Config.model_validate(
             # By epochs: what tests find must not depend on how busy the machine is.
             {"folder": ".", "body": body, "loads": loads, "samples": samples, "training": {"epochs": 200, "modes": 16}}
         )
-    samples = {"train": 256, "validation": 32, "test": 48}
+    samples = {"train": 256, "validation": 32, "test": 48, "calibration": 48}
     body = {"source": "liver-phantom", "cell_size": 0.0105}
     return Config.model_validate(
         {"folder": ".", "body": body, "loads": loads, "samples": samples, "training": {"seconds": 60.0}}

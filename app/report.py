@@ -229,9 +229,10 @@ def data_section(space: Workspace, studio: Studio) -> Section:
             "softtwin generate organ.toml goes on."
         )
     rejected = data.rejected().reasons
-    peaks: dict[str, Floats] = {split: _peaks(data.samples(split, _MOST_DRAWS).displacements) for split in SPLITS}
-    iterations: dict[str, Ints] = {split: _iterations(data, split) for split in SPLITS}
     drawn = dict(data.header["samples"])
+    splits = [split for split in SPLITS if drawn.get(split)]
+    peaks: dict[str, Floats] = {split: _peaks(data.samples(split, _MOST_DRAWS).displacements) for split in splits}
+    iterations: dict[str, Ints] = {split: _iterations(data, split) for split in splits}
     return {
         "drawn": drawn,
         "accepted": sum(drawn.values()) - len(rejected),
@@ -252,17 +253,18 @@ def _iterations(data: DataSet, split: Any) -> Ints:
     return figures["iterations"][figures["reason"] == 0][:_MOST_DRAWS]
 
 
-_SPLIT_COLOURS = ("#4c78a8", "#72b7b2", "#f2a65a")
+_SPLIT_COLOURS = ("#4c78a8", "#72b7b2", "#f2a65a", "#b79ad6")
 
 
 def _draw_data(sheet: Figure, peaks: Mapping[str, Floats], iterations: Mapping[str, Ints]) -> None:
     left, right = sheet.subplots(1, 2)
-    left.hist([1e3 * peaks[split] for split in peaks], bins=24, stacked=True, color=_SPLIT_COLOURS, label=list(peaks))
+    colours = _SPLIT_COLOURS[: len(peaks)]
+    left.hist([1e3 * peaks[split] for split in peaks], bins=24, stacked=True, color=colours, label=list(peaks))
     left.set(xlabel="largest nodal displacement (mm)", ylabel="samples")
     left.legend(frameon=False)
     every = np.concatenate(list(iterations.values()))
     bins = np.arange(every.min(initial=0), every.max(initial=1) + 2) - 0.5
-    right.hist(list(iterations.values()), bins=bins, stacked=True, color=_SPLIT_COLOURS)
+    right.hist(list(iterations.values()), bins=bins, stacked=True, color=colours)
     right.set(xlabel="Newton iterations of a sample", ylabel="samples")
     right.xaxis.get_major_locator().set_params(integer=True)
 

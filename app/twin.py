@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,6 +41,10 @@ from softtwin.registration.verdict import Judgement, Verdict
 from .config import Config, ConfigError, RegistrationSection, files_frame, parse_config
 from .inputs import check_material, load_plan
 from .workspace import open_workspace
+
+if TYPE_CHECKING:
+    from softtwin.surrogate.certificate import Certificate, Certifier
+    from softtwin.surrogate.model import SurrogateState
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -145,6 +149,28 @@ class Twin:
             forces: (n, 3), newtons, in the body's node order.
         """
         return self.model.solve(forces)
+
+    def certify(self, forces: ArrayLike, state: SurrogateState | None = None) -> Certificate:
+        """How wrong the network's displacement under nodal forces may be, and whether that may be relied upon.
+
+        Args:
+            forces: (n, 3), newtons, in the body's node order.
+            state: what `predict` found for them, if that is at hand.
+
+        Raises:
+            CalibrationError: the model is no network, or it was never calibrated.
+        """
+        return self._certifier.certify(forces, state)
+
+    @cached_property
+    def _certifier(self) -> Certifier:
+        from softtwin.surrogate.certificate import Certifier  # torch is needed here alone
+        from softtwin.surrogate.model import Surrogate
+        from softtwin.surrogate.signs import CalibrationError
+
+        if not isinstance(self.model, Surrogate):
+            raise CalibrationError(f"Twin.certify: expected a twin with a network, got {type(self.model).__name__}.")
+        return Certifier(self.model)
 
     def register(
         self, cloud: ArrayLike, zone: str | None = None, start: Registration | None = None, camera: Camera = None

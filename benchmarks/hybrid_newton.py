@@ -3,9 +3,9 @@
     python benchmarks/hybrid_newton.py [--bodies small large] [--seconds 300] [--only ours]
 
 Half of the loads are drawn like those that were learned (and are none of them), half are up to twice as large. A
-failure counts at the time it took. Every state found is compared with the one that 20 load steps lead to from rest. Each row is
-written as it is finished; the same command goes on. Data and networks are made under benchmarks/runs/ where they are
-not there.
+failure counts at the time it took. Every state found is compared with the one that 20 load steps lead to from rest.
+Each row is written as it is finished; the same command goes on. Data and networks are made under benchmarks/runs/ where
+they are not there.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ class Plan:
         young_modulus: pascals.
         poisson_ratio: in [0, 0.5).
         loads: how loads are drawn.
-        samples: draws of each split.
+        samples: draws of each split; `calibration` may be left out.
         block: draws of one block, the unit of work and of storage.
         ramp: draws that share one load at growing sizes, each solved from the one before; divides `block`. Several
             times cheaper a draw than independent loads where these need many Newton iterations from rest.
@@ -88,9 +88,11 @@ class Plan:
     def __post_init__(self) -> None:
         if self.material not in MATERIALS:
             raise ValueError(f"Plan.material: expected one of {sorted(MATERIALS)}, got {self.material!r}.")
-        if set(self.samples) != set(SPLITS) or min(self.samples.values()) < 1:
+        *always, optional = SPLITS
+        if set(self.samples) - {optional} != set(always) or min(self.samples.values()) < 1:
             raise ValueError(
-                f"Plan.samples: expected at least one draw for each of {SPLITS}, got {dict(self.samples)}."
+                f"Plan.samples: expected at least one draw for each of {always} (and of {optional}, or no word of it), "
+                f"got {dict(self.samples)}."
             )
         if self.block < 1:
             raise ValueError(f"Plan.block: expected at least 1, got {self.block}.")

@@ -12,7 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import splu
 
 from softtwin.meshes.body import Body
-from softtwin.reference.data.dataset import SPLITS, DataSet, DataSetError, LinearResponse, create, write_block
+from softtwin.reference.data.dataset import (
+    SPLITS,
+    DataSet,
+    DataSetError,
+    LinearResponse,
+    Split,
+    create,
+    write_block,
+)
 from softtwin.reference.data.materials import MATERIALS, Material
 from softtwin.reference.data.schema import Reason, Sizes
 
@@ -94,7 +102,7 @@ def data_set_from_arrays(
     }
     shapes = np.zeros((1, *body.points.shape))  # no modes: one that does nothing
     data = create(Path(path), header, body, response, shapes, np.zeros(1))
-    for split in SPLITS:
+    for split in chosen:
         first = data.split_draws(split).start
         for i in range(0, len(chosen[split]), _BLOCK):
             some = chosen[split][i : i + _BLOCK]
@@ -166,7 +174,7 @@ def _roughness(body: Body, displacements: Floats) -> float:
     return float(np.sqrt(differing(np.arange(len(body.points))) / np.mean(shuffled)))
 
 
-def _splits(splits: Mapping[str, ArrayLike] | None, count: int, seed: int) -> dict[str, Ints]:
+def _splits(splits: Mapping[str, ArrayLike] | None, count: int, seed: int) -> dict[Split, Ints]:
     """Sample numbers of each split.
 
     Raises:
@@ -175,9 +183,15 @@ def _splits(splits: Mapping[str, ArrayLike] | None, count: int, seed: int) -> di
     if splits is None:
         order, held = np.random.default_rng(seed).permutation(count), max(1, count // 10)
         splits = {"train": order[2 * held :], "validation": order[:held], "test": order[held : 2 * held]}
-    if set(splits) != set(SPLITS):
-        raise ValueError(f"data_set_from_arrays.splits: expected {', '.join(SPLITS)}, got {', '.join(splits)}.")
-    chosen: dict[str, Ints] = {name: np.asarray(splits[name], dtype=np.int64).ravel() for name in SPLITS}
+    *always, optional = SPLITS
+    if set(splits) - {optional} != set(always):
+        raise ValueError(
+            f"data_set_from_arrays.splits: expected {', '.join(always)} (and {optional} for bounds on errors), got "
+            f"{', '.join(splits)}."
+        )
+    chosen: dict[Split, Ints] = {
+        name: np.asarray(splits[name], dtype=np.int64).ravel() for name in SPLITS if name in splits
+    }
     every = np.concatenate(list(chosen.values()))
     if min(map(len, chosen.values())) == 0:
         raise ValueError(f"data_set_from_arrays.splits: expected samples in each split, got too few: {count} in all.")

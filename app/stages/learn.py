@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 
 from softtwin.meshes.metrics import nodal_distances
 from softtwin.reference.data.dataset import DataSet
+from softtwin.surrogate.calibration import CalibrationWarning, calibrate, coverage
 from softtwin.surrogate.course import chosen_device
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
@@ -22,6 +24,7 @@ from softtwin.surrogate.physics import Physics
 from softtwin.surrogate.plan import Device, TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.registry import ARCHITECTURES
+from softtwin.surrogate.signs import CalibrationError
 from softtwin.surrogate.train import train
 from softtwin.surrogate.twin import load, save
 
@@ -61,12 +64,23 @@ def _train(space: Workspace, data: DataSet, fresh: bool, plan: TrainingPlan) -> 
         shutil.rmtree(space.training, ignore_errors=True)
     with timed(space, "train", train_inputs(space, data)):
         surrogate = with_discrepancy(with_domain(train(data, plan, space.training), data), data)
+        if data.header["samples"].get("calibration"):
+            surrogate = calibrated(surrogate, data)
         save(surrogate, space.twin)
         partial = space.twin / ".body.vtu.partial"
         shutil.copyfile(space.body, partial)
         os.replace(partial, space.twin / "body.vtu")
         write_whole(space.twin / "organ.toml", to_toml(space.config))
     return surrogate
+
+
+def calibrated(surrogate: Surrogate, data: DataSet) -> Surrogate:
+    """The surrogate with a certificate; without, and said, where none can be given."""
+    try:
+        return calibrate(surrogate, data)
+    except CalibrationError as error:
+        warnings.warn(f"the twin has no bounds on its errors: {error}", CalibrationWarning, stacklevel=2)
+        return surrogate
 
 
 def training_plan(section: TrainingSection, device: Device = "auto", processes: int = 1) -> TrainingPlan:
@@ -125,11 +139,16 @@ def validate_stage(space: Workspace) -> str:
     with timed(space, "validate", validate_inputs(space, data)):
         evaluation = evaluate(surrogate, data)
         _write_predictions(space, surrogate, data)
-        figures = evaluation.as_dict()
-        table = json.dumps({"table": str(evaluation), "figures": figures}, indent=1)
+        figures, text = evaluation.as_dict(), str(evaluation)
+        more: dict[str, Any] = {"held_out": figures}
+        if surrogate.card.get("certificate"):
+            bounds = coverage(surrogate, data)
+            text += f"\n\n{bounds}"
+            more["certificate"] = {**surrogate.card["certificate"], "held_out": bounds.as_dict()}
+        table = json.dumps({"table": text, "figures": figures}, indent=1)
         write_whole(space.folder / "validation.json", table)
-        save(surrogate.with_card(held_out=figures), space.twin)
-    return str(evaluation)
+        save(surrogate.with_card(**more), space.twin)
+    return text
 
 
 def _write_predictions(space: Workspace, surrogate: Surrogate, data: DataSet) -> None:

@@ -24,8 +24,8 @@ from .schema import Reason
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Split = Literal["train", "validation", "test"]
-SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+Split = Literal["train", "validation", "test", "calibration"]
+SPLITS: tuple[Split, ...] = ("train", "validation", "test", "calibration")  # the last may be absent
 FORMAT = 1
 
 
@@ -194,7 +194,7 @@ class DataSet:
         """Numbers of the draws of a split; splits share no block."""
         first = 0
         for name in SPLITS:
-            count = self.header["samples"][name]
+            count = self.header["samples"].get(name, 0)
             if name == split:
                 return range(first, first + count)
             first += -(-count // self.header["block"]) * self.header["block"]
@@ -204,7 +204,7 @@ class DataSet:
         """The accepted samples of a split, checked against their checksums.
 
         Args:
-            split: `train`, `validation` or `test`.
+            split: `train`, `validation`, `test` or `calibration`.
             limit: take the first so many draws only.
 
         Raises:
@@ -362,7 +362,7 @@ def create(
 
 def _create_samples(root: zarr.Group, header: dict[str, Any], sizes: schema.Sizes) -> None:
     block = header["block"]
-    blocks = sum(-(-header["samples"][split] // block) for split in SPLITS)
+    blocks = sum(-(-header["samples"].get(split, 0) // block) for split in SPLITS)
     for name in schema.NAMES:
         shape, kind = sizes.shape(name), schema.kind(name)
         root.create_array(

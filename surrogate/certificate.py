@@ -1,0 +1,100 @@
+"""How wrong a prediction may be, said without knowing the truth: bounds that a calibrated share of loads keeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softtwin.reference.data.loading import checked_array
+
+from .model import Surrogate, SurrogateState
+from .signs import CalibrationError, SignReader, Signs
+
+Floats = NDArray[np.float64]
+ERRORS = ("mean", "largest")  # over the nodes
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What may be said of one prediction.
+
+    Args:
+        mean: bound on the mean nodal error, metres, which `confidence` of the loads like those of the calibration keep;
+            infinite where nothing can be said.
+        largest: the same for the largest nodal error.
+        confidence: share of loads, in (0, 1).
+        signs: what it is read from.
+        reasons: why the load or the prediction is like none of the calibration, for people; empty inside.
+    """
+
+    mean: float
+    largest: float
+    confidence: float
+    signs: Signs
+    reasons: tuple[str, ...]
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether the bound may be relied upon; outside it is a number of no standing."""
+        return not self.reasons
+
+
+class Certifier:
+    """Certificates for the predictions of a calibrated surrogate.
+
+    Args:
+        surrogate: one that `calibrate` has made.
+
+    Raises:
+        CalibrationError: it was never calibrated, or its card does not name the material.
+    """
+
+    def __init__(self, surrogate: Surrogate) -> None:
+        known = surrogate.card.get("certificate")
+        if not known:
+            raise CalibrationError(
+                "Certifier.surrogate: expected a twin that was calibrated, got one without a certificate in its card; "
+                "give it calibration samples (samples.calibration) and train it again."
+            )
+        self._known: dict[str, Any] = dict(known)
+        self.reader = SignReader(surrogate)
+
+    def certify(self, forces: ArrayLike, state: SurrogateState | None = None) -> Certificate:
+        """How wrong the prediction for nodal forces may be.
+
+        Args:
+            forces: (n, 3), newtons.
+            state: what the surrogate predicts for them, if that is known.
+
+        Raises:
+            ValueError: another shape, or numbers that are not finite.
+        """
+        load = checked_array("Certifier.forces", forces, self.reader.surrogate.body.points.shape)
+        return self.read(self.reader.read(load, state or self.reader.surrogate.solve(load)))
+
+    def read(self, signs: Signs) -> Certificate:
+        """What signs say."""
+        known = self._known
+        place = int(np.searchsorted(known["edges"], signs.size, side="right"))
+        bounds = {}
+        for error in ERRORS:
+            factor, size = known["quantiles"][error][place], np.exp(signs.row @ known["powers"][error])
+            bounds[error] = np.inf if factor is None or not np.isfinite(signs.residual) else float(factor * size)
+        return Certificate(**bounds, confidence=known["confidence"], signs=signs, reasons=tuple(self._reasons(signs)))
+
+    def _reasons(self, signs: Signs) -> list[str]:
+        limits, found = self._known["limits"], []
+        if not np.isfinite(signs.residual):
+            found.append("the prediction turns a cell inside out or has no balance to speak of")
+        if signs.extent is not None and signs.extent > 1.0:
+            found.append(f"the load lies {signs.extent:.2g} times as far out as the farthest of the training")
+        if signs.size > limits["size"]:
+            found.append(f"it moves a node by {1e3 * signs.size:.3g} mm, more than any calibrated load")
+        if limits["residual"] < signs.residual < np.inf:
+            found.append(f"forces of {signs.residual:.3g} times the load are out of balance, more than ever before")
+        if limits["step"] < signs.step < np.inf:
+            found.append(f"balance is {1e3 * signs.step:.3g} mm away, farther than ever before")
+        return found

@@ -1,0 +1,212 @@
+"""Bounds on errors that nobody has seen: how many keep them, what is set aside, and what is no certificate at all."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.shapes import beam
+from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.samplers import LoadPlan
+from softtwin.reference.generate import Plan, generate, ramp_loads
+from softtwin.reference.solve.problem import Problem
+from softtwin.surrogate.calibration import CalibrationWarning, calibrate, coverage, needed, quantile
+from softtwin.surrogate.certificate import Certifier
+from softtwin.surrogate.domain import with_domain
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.signs import CalibrationError, SignReader
+from softtwin.surrogate.train import train
+from softtwin.surrogate.twin import load, save
+
+pytestmark = pytest.mark.fenicsx
+COUNTS = {"train": 96, "validation": 48, "test": 256, "calibration": 256}
+PLAN = Plan(loads=LoadPlan(modes=4, displacement=0.15), samples=COUNTS, block=16)
+
+
+@pytest.fixture(scope="module")
+def small() -> Body:
+    return beam((6, 2, 2), (0.6, 0.2, 0.2), "hexahedron")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory, small: Body) -> DataSet:
+    made = generate(tmp_path_factory.mktemp("certificate") / "data.zarr", small, PLAN)
+    assert made is not None
+    return made
+
+
+@pytest.fixture(scope="module")
+def bare(data: DataSet) -> Surrogate:
+    return with_domain(train(data, TrainingPlan(Reduced(modes=16, width=32), epochs=150)), data)
+
+
+@pytest.fixture(scope="module")
+def surrogate(bare: Surrogate, data: DataSet) -> Surrogate:
+    return calibrate(bare, data)
+
+
+def loads(data: DataSet, count: int) -> list[np.ndarray]:
+    out = []
+    for forces in data.samples("test").forces[:count]:
+        whole = np.zeros_like(data.body.points)
+        whole[data.response.loaded] = forces
+        out.append(whole)
+    return out
+
+
+# ---------------------------------------------------------------------- what they are worth
+
+
+@pytest.mark.parametrize("error", ["mean", "largest"])
+def test_as_many_samples_keep_their_bounds_as_should(surrogate: Surrogate, data: DataSet, error: str) -> None:
+    """Of 256 with a bound for 90 %: three standard deviations of what chance in both splits leaves."""
+    found = coverage(surrogate, data)
+    assert abs(found.kept[error] - 0.9) < 3.0 * np.sqrt(2 * 0.09 / 256)
+    assert sum(found.in_range) == found.samples and len(found.in_range) == 4
+    assert found.rank_correlation[error] > 0.85
+    assert all(1.0 < width < 4.0 for width in found.widths[error])
+    assert found.outside <= 0.05 * found.samples
+
+
+def test_a_higher_confidence_is_a_wider_bound(bare: Surrogate, data: DataSet, surrogate: Surrogate) -> None:
+    force = loads(data, 1)[0]
+    wide, narrow = (Certifier(calibrate(bare, data, confidence=c)).certify(force) for c in (0.97, 0.5))
+    usual = Certifier(surrogate).certify(force)
+    assert 0.0 < narrow.mean < usual.mean < wide.mean
+    assert usual.mean <= usual.largest and (narrow.confidence, usual.confidence) == (0.5, 0.9)
+
+
+def test_loads_far_beyond_those_learned_are_set_aside_and_not_refused(surrogate: Surrogate, data: DataSet) -> None:
+    certifier, tops = Certifier(surrogate), [ramp_loads(data, PLAN, 10**6 + i)[0] for i in range(64)]
+    near, far = ([certifier.certify(scale * top) for top in tops] for scale in (0.9, 3.0))
+    assert sum(each.is_inside for each in near) >= 60
+    assert not any(each.is_inside for each in far)
+    assert "times as far out as the farthest" in " ".join(reason for each in far for reason in each.reasons)
+    assert all(np.isfinite(each.mean) for each in near)
+
+
+def test_a_prediction_inside_out_has_no_bound(surrogate: Surrogate, data: DataSet) -> None:
+    wrong = SimpleNamespace(displacement=-2.0 * data.body.points, extent=0.5)
+    found = Certifier(surrogate).certify(loads(data, 1)[0], wrong)
+    assert found.mean == found.largest == np.inf and not found.is_inside
+    assert "inside out" in found.reasons[0]
+
+
+def test_no_load_is_certain(surrogate: Surrogate, small: Body) -> None:
+    found = Certifier(surrogate).certify(np.zeros_like(small.points))
+    assert found.mean < 1e-9 and found.is_inside
+
+
+def test_a_saved_twin_keeps_its_certificate(surrogate: Surrogate, data: DataSet, tmp_path: Path) -> None:
+    save(surrogate, tmp_path)
+    again = load(tmp_path, data.body)
+    force = loads(data, 1)[0]
+    assert Certifier(again).certify(force) == Certifier(surrogate).certify(force)
+
+
+# ---------------------------------------------------------------------- what they are read from
+
+
+def test_the_step_is_the_reference_s_from_the_tangent_at_rest(bare: Surrogate, data: DataSet, small: Body) -> None:
+    """Under a load so small that nothing turns."""
+    force = 1e-3 * loads(data, 1)[0]
+    state = bare.solve(force)
+    signs = SignReader(bare).read(force, state)
+    with Problem(small, PLAN.build_material()) as problem:
+        gap = problem.internal_forces(state.displacement) - force
+        gap[small.fixed] = 0.0
+        step = problem.apply_inverse(gap.ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(signs.step, np.linalg.norm(step, axis=1).mean(), rtol=1e-2)
+    np.testing.assert_allclose(signs.residual, np.linalg.norm(gap) / np.linalg.norm(force), rtol=1e-6)
+    assert signs.size == np.linalg.norm(state.displacement, axis=1).max()
+
+
+def test_a_turned_body_has_turned_nodes(bare: Surrogate, small: Body) -> None:
+    import torch
+
+    turn = Rotation.from_rotvec([0.3, -1.2, 2.0]).as_matrix()
+    stretched = small.points @ np.diag([1.2, 0.9, 0.8]) @ turn.T
+    found = SignReader(bare)._rotations(torch.from_numpy(stretched - small.points))
+    np.testing.assert_allclose(found, np.broadcast_to(turn, found.shape), atol=1e-12)
+
+
+def test_quantiles_are_those_of_crepes() -> None:
+    crepes = pytest.importorskip("crepes", reason="crepes is absent")
+    chance = np.random.default_rng(0)
+    bins = np.repeat([0, 1, 2], [100, 87, 113])  # where 0.1 (n + 1) is whole, crepes rounds it down to the next below
+    scores = np.abs(chance.standard_normal(len(bins)))
+    theirs = crepes.ConformalRegressor()
+    theirs.fit(scores, sigmas=np.ones(len(bins)), bins=bins)
+    expected = theirs.predict_int(np.zeros(3), sigmas=np.ones(3), bins=np.arange(3), confidence=0.9)[:, 1]
+    np.testing.assert_array_equal([quantile(scores[bins == place], 0.9) for place in range(3)], expected)
+
+
+@pytest.mark.parametrize(("confidence", "count"), [(0.9, 9), (0.8, 4), (0.5, 1), (0.99, 99)])
+def test_how_many_samples_a_bound_needs(confidence: float, count: int) -> None:
+    assert needed(confidence) == count
+    assert quantile(np.arange(1.0, count + 1.0), confidence) == count
+    assert quantile(np.arange(1.0, float(count)), confidence) is None
+
+
+# ---------------------------------------------------------------------- what is no certificate
+
+
+def test_too_few_samples_are_refused_with_how_many_are_needed(bare: Surrogate, data: DataSet) -> None:
+    with pytest.raises(CalibrationError, match=r"expected at least 999 accepted samples.*got 256 in the calibration"):
+        calibrate(bare, data, confidence=0.999)
+
+
+@pytest.mark.parametrize("confidence", [0.0, 1.0, 90.0, float("nan")])
+def test_a_confidence_that_is_none_is_refused(bare: Surrogate, data: DataSet, confidence: float) -> None:
+    with pytest.raises(CalibrationError, match=r"calibrate\.confidence: expected a number in \(0, 1\)"):
+        calibrate(bare, data, confidence=confidence)
+
+
+def test_data_of_another_body_are_refused(bare: Surrogate, tmp_path: Path) -> None:
+    counts = {"train": 1, "validation": 1, "test": 1}
+    other = generate(
+        tmp_path / "data.zarr", beam((3, 1, 1), (0.6, 0.2, 0.2), "hexahedron"), replace(PLAN, samples=counts)
+    )
+    with pytest.raises(CalibrationError, match="is of another body"):
+        calibrate(bare, other)
+
+
+def test_loads_drawn_otherwise_are_told(bare: Surrogate, data: DataSet) -> None:
+    plan = {
+        **bare.card["data"]["plan"],
+        "loads": {**bare.card["data"]["plan"]["loads"], "kind": "random", "patches": 3},
+    }
+    elsewhere = bare.with_card(data={**bare.card["data"], "plan": plan})
+    with pytest.warns(CalibrationWarning, match=r"drawn otherwise than those that were learned \(in kind, patches\)"):
+        calibrate(elsewhere, data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        calibrate(bare, data)
+
+
+def test_a_twin_that_was_not_calibrated_has_no_certificate(bare: Surrogate) -> None:
+    with pytest.raises(CalibrationError, match=r"expected a twin that was calibrated.*samples\.calibration"):
+        Certifier(bare)
+
+
+def test_a_card_without_a_material_has_none_either(surrogate: Surrogate) -> None:
+    silent = surrogate.with_card(data={**surrogate.card["data"], "plan": {}})
+    with pytest.raises(CalibrationError, match="expected a card that names the material"):
+        Certifier(silent)
+
+
+@pytest.mark.parametrize("forces", [np.zeros((3, 3)), np.full((63, 3), np.nan)], ids=["shape", "nan"])
+def test_forces_are_checked(surrogate: Surrogate, forces: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"Certifier\.forces"):
+        Certifier(surrogate).certify(forces)
