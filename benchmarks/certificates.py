@@ -1,0 +1,140 @@
+"""Bounds on errors that nobody has seen: how many keep them, how wide they are, what they cost, what is set aside.
+
+    python benchmarks/certificates.py [--seconds 200] [--ranks 2] [--bodies ranges liver]
+
+The beam has 2,500 loads to calibrate with and 2,500 to test on in each of four ranges of size. Data and networks are
+made under benchmarks/runs/ where they are not there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from networks import RUNS
+from networks_bodies import case, data_of
+from numpy.typing import NDArray
+from record import RESULTS, write
+from scipy.stats import spearmanr
+from threadpoolctl import threadpool_limits
+
+from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.generate import Plan, ramp_loads
+from softtwin.reference.solve.problem import Problem
+from softtwin.surrogate.calibration import calibrate, coverage
+from softtwin.surrogate.certificate import Certifier
+from softtwin.surrogate.domain import with_domain
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.train import train
+from softtwin.surrogate.twin import load as load_twin
+from softtwin.surrogate.twin import save
+
+Floats = NDArray[np.float64]
+NAME = "certificates"
+FRESH = 1_000_000  # numbers of loads begin here: none of them is in a data set
+FAR, TIMED, STEPPED = 1000, 100, 300  # loads three times too large; predictions that are timed; Newton steps
+
+
+def network_of(body: str, data: DataSet, seconds: float) -> Surrogate:
+    """The reduced network of a body, trained and calibrated once."""
+    folder = RUNS / f"certificates-{body}-{seconds:g}s"
+    if not (folder / "surrogate.json").exists():
+        plan = TrainingPlan(Reduced(modes=case(body).modes), seconds=seconds)
+        save(calibrate(with_domain(train(data, plan), data), data), folder)
+    return load_twin(folder, data.body)
+
+
+def set_aside(certifier: Certifier, data: DataSet, plan: Plan) -> dict[str, Any]:
+    """Share of loads that is said to be outside: at three times the largest that were learned, and at the largest."""
+    tops = [ramp_loads(data, plan, FRESH + i)[0] for i in range(FAR)]
+    return {
+        f"times_{scale:g}": float(np.mean([not certifier.certify(scale * top).is_inside for top in tops]))
+        for scale in (1.0, 3.0)
+    }
+
+
+def costs(certifier: Certifier, loads: list[Floats], problem: Problem) -> dict[str, float]:
+    """Median wall times of a prediction and of each tier, milliseconds."""
+    surrogate, taken = certifier.reader.surrogate, {"prediction": [], "distance": [], "step": [], "newton": []}
+
+    def timed(name: str, run: Callable[[], Any]) -> Any:
+        began = time.perf_counter()
+        found = run()
+        taken[name].append(1e3 * (time.perf_counter() - began))
+        return found
+
+    for load in loads:
+        state = timed("prediction", lambda load=load: surrogate.solve(load))
+        timed("distance", lambda state=state: state.extent)
+        timed("step", lambda load=load, state=state: certifier.certify(load, state))
+        timed("newton", lambda load=load, state=state: newton_step(problem, load, state.displacement))
+    return {name: float(np.median(values)) for name, values in taken.items()}
+
+
+def newton_step(problem: Problem, load: Floats, displacement: Floats) -> tuple[float, int | None]:
+    """Mean nodal length of Newton's step from a prediction, metres, and the negative pivots there."""
+    start = displacement.copy()
+    start[problem.body.fixed] = 0.0
+    gap = problem.internal_forces(start) - load
+    gap[problem.body.fixed] = 0.0
+    step = problem.apply_inverse(gap.ravel(), start).reshape(-1, 3)
+    return float(np.linalg.norm(step, axis=1).mean()), problem.negative_pivots(start)
+
+
+def stepped(surrogate: Surrogate, data: DataSet, problem: Problem) -> dict[str, Any]:
+    """How well the length of one Newton step tells the error, and how many predictions its tangent finds indefinite."""
+    samples = data.samples("test", STEPPED)
+    lengths, errors, indefinite = [], [], 0
+    for forces, truth in zip(samples.forces, samples.displacements, strict=True):
+        load = np.zeros_like(data.body.points)
+        load[data.response.loaded] = forces
+        predicted = surrogate.solve(load).displacement
+        length, pivots = newton_step(problem, load, predicted)
+        indefinite += bool(pivots)
+        lengths.append(length)
+        errors.append(np.linalg.norm(predicted - truth, axis=1).mean())
+    ratio = np.array(errors) / np.array(lengths)
+    return {
+        "samples": len(errors),
+        "rank_correlation": float(spearmanr(lengths, errors).statistic),
+        "error_over_length_p5_p50_p95": np.percentile(ratio, (5, 50, 95)).tolist(),
+        "indefinite": indefinite,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--bodies", nargs="+", default=["ranges"], help="cases of networks_bodies.py")
+    parser.add_argument("--seconds", type=float, default=200.0, help="of training")
+    parser.add_argument("--ranks", type=int, default=2)
+    parser.add_argument("--name", default=NAME, help="of the record")
+    arguments = parser.parse_args()
+    path = RESULTS / f"{arguments.name}.json"
+    found = json.loads(path.read_text())["figures"] if path.exists() else {}
+    for body in arguments.bodies:
+        data, plan = data_of(body, arguments.ranks, True), case(body).plan
+        surrogate = network_of(body, data, arguments.seconds)
+        held_out = coverage(surrogate, data)
+        print(held_out, flush=True)
+        certifier = Certifier(surrogate)
+        tops = [ramp_loads(data, plan, FRESH + i)[0] for i in range(TIMED)]
+        with threadpool_limits(1), Problem(data.body, plan.build_material()) as problem:
+            found[body] = {
+                "calibrated": surrogate.card["certificate"],
+                "held_out": held_out.as_dict(),
+                "outside": set_aside(certifier, data, plan),
+                "newton_step": stepped(surrogate, data, problem),
+                "ms": costs(certifier, tops, problem),
+            }
+        print(json.dumps({name: value for name, value in found[body].items() if name != "held_out"}, indent=1))
+        write(path.stem, found)
+
+
+if __name__ == "__main__":
+    main()
