@@ -29,7 +29,7 @@ from softtwin.surrogate.umesh import UMesh
 Floats = NDArray[np.float64]
 
 MODES, BLOCK, GAMMA = 6, 8, 40.0
-COUNTS = {"train": 64, "validation": 16, "test": 16}
+COUNTS = {"train": 64, "validation": 16, "test": 16, "calibration": 16}
 
 
 class ClosedForm:

@@ -31,7 +31,7 @@ def test_the_guide_runs(data: DataSet, closed_form: Any, tmp_path: Path, capsys,
         "simulated_displacements": 1e3 * moved,
     }
     blocks = re.findall(r"```python\n(.*?)```", TEXT, flags=re.S)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     for block in blocks:
         exec(compile(block, "docs/surrogates.md", "exec"), names)
     assert "accepted test samples averaged" in capsys.readouterr().out
