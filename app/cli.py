@@ -85,15 +85,23 @@ def mesh(configuration: Path) -> None:
 @click.argument("configuration", type=_EXISTING)
 @click.option("--redo", multiple=True, type=int, help="Make this block again (may be repeated).")
 @click.option("--again", is_flag=True, help="Throw a data set that is there away, and make it anew.")
-def generate(configuration: Path, redo: tuple[int, ...], again: bool) -> None:
+@click.option("--part", metavar="I/N", help="Solve part I of N alone, I from 0, beside other jobs (examples/slurm.sh).")
+def generate(configuration: Path, redo: tuple[int, ...], again: bool, part: str | None) -> None:
     """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped.
 
-    Blocks that are damaged are found and made again. Another body or configuration is refused.
+    Blocks that are damaged are found and made again. Another body or configuration is refused. Once all parts of an
+    array of jobs have ended, `generate` without `--part` makes what is missing, and the Jacobians.
     """
+    from softtwin.reference.data.part import Part
+
     from .stages.generate import describe_data, generate_stage
 
-    data = generate_stage(configuration, redo, again)
-    if data is not None:
+    chosen = None if part is None else Part.parse(part)
+    data = generate_stage(configuration, redo, again, chosen)
+    if data is not None and chosen is not None:
+        missing = len(data.missing_blocks())
+        click.echo(f"part {chosen}: done; {missing} of {data.block_count} blocks of {data.path} are still missing")
+    elif data is not None:
         click.echo(describe_data(data))
         click.echo(f"written to {data.path}")
 

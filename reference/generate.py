@@ -39,6 +39,7 @@ from .data.dataset import (
 from .data.lock import locked
 from .data.materials import MATERIALS, Material
 from .data.outcome import Equilibrium, NotConverged
+from .data.part import Part, at_work_on, refuse_parts_at_work
 from .data.samplers import LoadPlan, check_loads, draw_load, loaded_nodes
 from .data.schema import Reason
 from .farm import quiet, share_out
@@ -55,6 +56,7 @@ _ANY = 256  # of them for forces unlike those that are drawn
 _LEAST_MODE = 1e-6
 _PILOTS = 9
 _PATIENCE_S = 20.0  # ranks live on for a moment when their mpirun is killed
+_PREPARING_S = 3600.0  # parts wait for the first of them
 _BEYOND = 2.0  # draws that move more than twice the wanted top are kept apart
 
 
@@ -123,6 +125,7 @@ def generate(
     comm: Any = MPI.COMM_WORLD,
     redo: Sequence[int] = (),
     again: bool = False,
+    part: Part | None = None,
 ) -> DataSet | None:
     """Make a data set, or go on with one that was interrupted; collective over the communicator.
 
@@ -137,6 +140,8 @@ def generate(
         comm: the ranks that share the work.
         redo: numbers of blocks to make again.
         again: throw away what is there.
+        part: solve the blocks of one part alone, beside other jobs that solve the others; the first to come prepares
+            the data set.
 
     Returns:
         The data set on rank 0, None on the others.
@@ -147,11 +152,16 @@ def generate(
         FailedElsewhere: on the others, where rank 0 raises one of these or what else went wrong, on any rank.
         ValueError: loads that the body cannot carry.
     """
+    if part is not None and (redo or again):
+        raise DataSetError("generate.part: expected no blocks to redo and nothing to throw away beside a part.")
     with threadpool_limits(1), ExitStack() as held:  # sums by several BLAS threads differ in their last bits
 
         def prepare() -> tuple[Path, list[int]]:
             assert path is not None and body is not None and plan is not None, "rank 0 gives all three"
+            if part is not None:
+                return Path(path), _prepare_part(Path(path), body, plan, part, held)
             held.enter_context(writing(Path(path)))
+            refuse_parts_at_work(Path(path))
             return Path(path), _prepare(Path(path), body, plan, redo, again)
 
         folder, blocks = on_first(comm, prepare) or (None, [])
@@ -160,20 +170,30 @@ def generate(
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
+def writing(path: Path, patience: float = _PATIENCE_S) -> Iterator[None]:
     """Keep others from writing the same data set; the system lets go of the lock when the process ends in any way."""
     path.parent.mkdir(parents=True, exist_ok=True)
     refusal = f"generate.path: another `generate` is at work in {path}; wait for it, end it, or choose another folder."
-    with locked(path.with_name(f".{path.name}.lock"), DataSetError(refusal), _PATIENCE_S):
+    with locked(path.with_name(f".{path.name}.lock"), DataSetError(refusal), patience):
         yield
 
 
-def _prepare(path: Path, body: Body, plan: Plan, redo: Sequence[int], again: bool) -> list[int]:
+def _prepare_part(path: Path, body: Body, plan: Plan, part: Part, held: ExitStack) -> list[int]:
+    """The blocks of a part that are to be solved; who comes while another prepares the data set waits for that."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    held.enter_context(at_work_on(path, part))
+    with writing(path, _PREPARING_S):
+        return [block for block in _prepare(path, body, plan, (), False, part) if part.has(block)]
+
+
+def _prepare(
+    path: Path, body: Body, plan: Plan, redo: Sequence[int], again: bool, part: Part | None = None
+) -> list[int]:
     """Make the data set where there is none; returns the numbers of the blocks to solve."""
     check_loads(body, plan.loads)
     present = None if again else existing(path)
     if present is not None and not _is_another(present, body, plan):
-        return _unfinished(present, redo)
+        return _unfinished(present, redo, part)
     if redo:
         raise DataSetError(f"generate.redo: expected a data set with blocks {list(redo)} in {path}, found none.")
     with Problem(body, plan.build_material(), plan.newton) as problem:
@@ -192,13 +212,13 @@ def _prepare(path: Path, body: Body, plan: Plan, redo: Sequence[int], again: boo
     return create(path, header, body, response, modes.shapes, modes.eigenvalues).missing_blocks()
 
 
-def _unfinished(present: DataSet, redo: Sequence[int]) -> list[int]:
+def _unfinished(present: DataSet, redo: Sequence[int], part: Part | None) -> list[int]:
     count = present.block_count
     wrong = [block for block in redo if not 0 <= block < count]
     if wrong:
         raise DataSetError(f"generate.redo: expected numbers of blocks in 0..{count - 1}, got {wrong}.")
     _ = present.response, present.shapes  # damage to what no block holds is found here
-    damaged = present.damaged_blocks()
+    damaged = present.damaged_blocks([block for block in range(count) if part is None or part.has(block)])
     for block, damage in damaged.items():
         warnings.warn(f"block {block} in {present.path} {damage}; it is made again.", DamagedBlock, stacklevel=2)
     for block in {*redo, *damaged}:

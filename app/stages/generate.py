@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.jacobians import missing_jacobians, stored_modes
+from softtwin.reference.data.part import Part
 from softtwin.reference.ranks import on_first
 from softtwin.surrogate.pod import learned_basis
 
@@ -22,7 +23,9 @@ from ..workspace import Workspace, open_workspace, record_stage
 Floats = NDArray[np.float64]
 
 
-def generate_stage(configuration: Path, redo: Sequence[int] = (), again: bool = False) -> DataSet | None:
+def generate_stage(
+    configuration: Path, redo: Sequence[int] = (), again: bool = False, part: Part | None = None
+) -> DataSet | None:
     """Solve the equilibria of the data set, and their Jacobians where these are wanted.
 
     Collective where mpirun started it; returns None on ranks other than 0.
@@ -31,6 +34,7 @@ def generate_stage(configuration: Path, redo: Sequence[int] = (), again: bool = 
         configuration: the configuration file, read on rank 0 alone.
         redo: numbers of blocks to make again.
         again: throw away what is there.
+        part: solve the blocks of one part alone; what is missing in the end, and the Jacobians, the whole stage makes.
 
     Raises:
         ConfigError: there is no body yet, or one of another configuration.
@@ -44,19 +48,20 @@ def generate_stage(configuration: Path, redo: Sequence[int] = (), again: bool = 
     comm, begin = MPI.COMM_WORLD, time.perf_counter()
     asked = on_first(comm, lambda: _read(configuration))
     if asked is None:
-        generate(None, None, None, comm)
+        generate(None, None, None, comm, part=part)
         if comm.bcast(None, root=0):
             on_first(comm, lambda: None)
             differentiate(None, None, comm)
         return None
     space, body = asked
     plan = plan_from_header({"plan": plan_entries(space.config)})
-    data = generate(space.data, body, plan, comm, redo, again)
+    data = generate(space.data, body, plan, comm, redo, again, part)
     assert data is not None
-    if comm.bcast(space.config.wants_jacobians, root=0):
+    if comm.bcast(part is None and space.config.wants_jacobians, root=0):
         modes = on_first(comm, lambda: jacobian_modes(space.config, data))
         differentiate(space.data, modes, comm)
-    record_stage(space, "generate", time.perf_counter() - begin, generate_inputs(space, body))
+    if part is None:
+        record_stage(space, "generate", time.perf_counter() - begin, generate_inputs(space, body))
     return data
 
 

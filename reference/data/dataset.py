@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -184,10 +184,15 @@ class DataSet:
         """Numbers of the blocks that are still to be made."""
         return np.flatnonzero(np.asarray(self._checksums()) == 0).tolist()
 
-    def damaged_blocks(self) -> dict[int, str]:
-        """Numbers of the blocks that are there but not as they were written, and what is wrong with each; reads all."""
+    def damaged_blocks(self, among: Collection[int] | None = None) -> dict[int, str]:
+        """Numbers of the blocks that are there but not as they were written, and what is wrong with each; reads all.
+
+        Args:
+            among: look at these alone.
+        """
         stored = self._checksums()
-        found = {block: self._damage(block, stored[block]) for block in range(len(stored)) if stored[block] != 0}
+        looked_at = range(len(stored)) if among is None else among
+        found = {block: self._damage(block, stored[block]) for block in looked_at if stored[block] != 0}
         return {block: damage for block, damage in found.items() if damage}
 
     def split_draws(self, split: Split) -> range:

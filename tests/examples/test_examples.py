@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import follow_a_stream
@@ -69,3 +72,39 @@ def test_run_exported_graphs(small_quickstart: Path, tmp_path: Path, capsys) -> 
     main(["export", str(twin), "--directions", "5"])
     assert run_exported_graphs.main(twin) < 0.05
     assert "graphs written to" in capsys.readouterr().out
+
+
+SMALL = """
+folder = "."
+[body]
+source = "beam"
+[samples]
+train = 12
+validation = 4
+test = 4
+block = 4
+jacobians = false
+"""
+
+
+@pytest.mark.fenicsx
+def test_an_array_of_jobs_under_plain_bash(tmp_path: Path) -> None:
+    """Two of three tasks at the same moment; the third is lost, which is told, and made by `generate`."""
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    script = Path(own_forward_model.__file__).parent / "slurm.sh"
+    organ = tmp_path / "organ.toml"
+    organ.write_text(SMALL)
+    bare = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
+    environment = bare | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "SLURM_ARRAY_TASK_COUNT": "3"}
+
+    def run(*command: str, **more: str) -> subprocess.Popen:
+        return subprocess.Popen(command, env=environment | more, stdout=subprocess.PIPE, text=True)
+
+    mesh = run("softtwin", "mesh", str(organ))
+    assert "nodes" in mesh.communicate(timeout=120)[0] and mesh.returncode == 0
+    tasks = [run("bash", str(script), str(organ), SLURM_ARRAY_TASK_ID=str(number)) for number in (0, 2)]
+    said = [task.communicate(timeout=120)[0] for task in tasks]
+    assert [task.returncode for task in tasks] == [0, 0]
+    assert any("2 of 5 blocks of" in each and "are still missing" in each for each in said)
+    whole = run("softtwin", "generate", str(organ))
+    assert "20 equilibria accepted, 0 rejected" in whole.communicate(timeout=120)[0]

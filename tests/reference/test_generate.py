@@ -21,13 +21,14 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data import dataset
 from softtwin.reference.data.dataset import SPLITS, DataSet, DataSetError, drop_block, probe_cotangents
+from softtwin.reference.data.part import Part, at_work_on
 from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.generate import DamagedBlock, Plan, generate, linear_response, solve_block
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 PLAN = Plan(
     loads=LoadPlan(modes=6, displacement=0.08),
-    samples={"train": 9, "validation": 3, "test": 4},
+    samples={"train": 9, "validation": 3, "test": 4, "calibration": 2},
     block=3,
     seed=5,
 )
@@ -35,10 +36,12 @@ PROGRAM = """
 import sys
 from softtwin.meshes.shapes import beam
 from softtwin.reference.generate import Plan, generate
+from softtwin.reference.data.part import Part
 from softtwin.reference.data.samplers import LoadPlan
 plan = Plan(loads=LoadPlan(modes=6, displacement=0.08), block=3, seed=5,
-            samples={"train": 9, "validation": 3, "test": 4})
-generate(sys.argv[1], beam((6, 2, 2), (0.6, 0.2, 0.2), "hexahedron"), plan)
+            samples={"train": 9, "validation": 3, "test": 4, "calibration": 2})
+part = Part.parse(sys.argv[2]) if len(sys.argv) > 2 else None
+generate(sys.argv[1], beam((6, 2, 2), (0.6, 0.2, 0.2), "hexahedron"), plan, part=part)
 """
 
 
@@ -247,6 +250,61 @@ def test_two_do_not_write_one_data_set(undisturbed: DataSet, tmp_path: Path, mon
     assert_same(undisturbed, generate(path, body(), PLAN))
 
 
+# ---------------------------------------------------------------------- parts
+
+
+def test_parts_that_know_nothing_of_each_other_make_the_same_data(
+    undisturbed: DataSet, tmp_path: Path, mpi_environment: dict[str, str]
+) -> None:
+    """Three at the same moment, none of which finds a data set; one of them under two ranks."""
+    path = tmp_path / "data.zarr"
+    launches = [["mpirun", "--oversubscribe", "-n", "2"] if shutil.which("mpirun") else [], [], []]
+    jobs = [
+        subprocess.Popen([*launch, sys.executable, "-c", PROGRAM, str(path), f"{i}/3"], env=mpi_environment)
+        for i, launch in enumerate(launches)
+    ]
+    assert [job.wait(timeout=120) for job in jobs] == [0, 0, 0]
+    assert_same(undisturbed, DataSet(path))
+
+
+def test_what_a_part_left_out_is_told_and_made_again(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    for number in (0, 2):
+        generate(path, body(), PLAN, part=Part(number, 3))
+    there = DataSet(path)
+    assert there.missing_blocks() == list(range(1, there.block_count, 3))
+    with pytest.raises(DataSetError, match=r"block 1 of .* was never finished; run `softtwin generate` again"):
+        there.samples("train")
+    drop_block(path, 0)
+    generate(path, body(), PLAN, part=Part(1, 3))
+    assert DataSet(path).missing_blocks() == [0]
+    assert_same(undisturbed, generate(path, body(), PLAN))
+
+
+def test_a_part_is_written_once_at_a_time(undisturbed: DataSet, tmp_path: Path) -> None:
+    path = tmp_path / "data.zarr"
+    shutil.copytree(undisturbed.path, path)
+    with at_work_on(path, Part(3, 16)):
+        with pytest.raises(DataSetError, match=r"another `generate` is at work on part 3/16"):
+            generate(path, body(), PLAN, part=Part(3, 16))
+        with pytest.raises(DataSetError, match=r"part 3/16 of .*data\.zarr is being made; wait for it"):
+            generate(path, body(), PLAN)
+        generate(path, body(), PLAN, part=Part(4, 16))
+    assert_same(undisturbed, generate(path, body(), PLAN))
+
+
+@pytest.mark.parametrize("words", ["3", "a/b", "-1/4", "4/4", "0/0", "1/2/3", ""])
+def test_parts_that_are_none_are_refused(words: str) -> None:
+    with pytest.raises(DataSetError, match=r"part: expected NUMBER/COUNT like 3/16|Part\.number: expected 0\.\."):
+        Part.parse(words)
+
+
+@pytest.mark.parametrize("others", [{"redo": [0]}, {"again": True}])
+def test_a_part_throws_nothing_away(undisturbed: DataSet, others: dict) -> None:
+    with pytest.raises(DataSetError, match=r"generate\.part: expected no blocks to redo and nothing to throw away"):
+        generate(undisturbed.path, body(), PLAN, part=Part(0, 2), **others)
+
+
 FAILING = """
 import sys
 from softtwin.meshes.shapes import beam
@@ -333,9 +391,9 @@ def test_only_blocks_that_are_there_can_be_made_again(undisturbed: DataSet, tmp_
     path = tmp_path / "data.zarr"
     shutil.copytree(undisturbed.path, path)
     for wrong in (999, -1):
-        with pytest.raises(DataSetError, match=rf"blocks in 0\.\.5, got \[{wrong}\]"):
+        with pytest.raises(DataSetError, match=rf"blocks in 0\.\.6, got \[{wrong}\]"):
             generate(path, body(), PLAN, redo=(0, wrong))
-        with pytest.raises(DataSetError, match=rf"a number in 0\.\.5, got {wrong}"):
+        with pytest.raises(DataSetError, match=rf"a number in 0\.\.6, got {wrong}"):
             drop_block(path, wrong)
     assert DataSet(path).missing_blocks() == []
     assert_same(undisturbed, generate(path, body(), PLAN, redo=(0,)))
