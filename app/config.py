@@ -103,6 +103,9 @@ class LoadsSection(_Section):
     amplitude: float = Field(
         0.0, ge=0.0, description="fixed amplitude in newtons instead; 0: scale to the displacement"
     )
+    sequence: Literal["random", "sobol"] = Field(
+        "random", description="how training loads are spread: at random, or evenly by a Sobol sequence"
+    )
 
 
 class SamplesSection(_Section):

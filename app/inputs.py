@@ -34,6 +34,7 @@ def load_plan(config: Config) -> LoadPlan:
         radius=loads.radius,
         displacement=loads.displacement,
         amplitude=loads.amplitude or None,
+        sequence=loads.sequence,
     )
 
 
@@ -41,6 +42,8 @@ def plan_entries(config: Config) -> dict[str, Any]:
     """What the data set is to be made of, in the words of a data set's header."""
     samples = config.samples
     loads = {**vars(load_plan(config)), "zones": list(config.loads.zones), "radius": list(config.loads.radius)}
+    if loads["sequence"] == "random":
+        del loads["sequence"]  # as in a data set's header
     return {
         **{word: getattr(config.material, name) for name, word in _MATERIAL.items()},
         "loads": loads,

@@ -40,7 +40,7 @@ from .data.lock import locked
 from .data.materials import MATERIALS, Material
 from .data.outcome import Equilibrium, NotConverged
 from .data.part import Part, at_work_on, refuse_parts_at_work
-from .data.samplers import LoadPlan, check_loads, draw_load, loaded_nodes
+from .data.samplers import LoadPlan, QuasiRandom, check_loads, draw_load, loaded_nodes, sobol_point
 from .data.schema import Reason
 from .farm import quiet, share_out
 from .fem.fenicsx import MPI, PETSc, dolfinx
@@ -231,6 +231,8 @@ def _plain(plan: Plan) -> dict[str, Any]:
     description["loads"]["zones"] = list(plan.loads.zones)
     description["loads"]["radius"] = list(plan.loads.radius)
     description["samples"] = dict(plan.samples)
+    if plan.loads.sequence == "random":
+        del description["loads"]["sequence"]  # data sets that are older than the choice do not name it
     return description
 
 
@@ -404,11 +406,15 @@ def ramp_loads(data: DataSet, plan: Plan, ramp: int) -> tuple[Floats, Floats]:
         ramp: number of the ramp; everything is a function of it and the seed.
     """
     rng = np.random.default_rng([plan.seed, 2, ramp])
-    load = draw_load(data.body, data.shapes, plan.loads, rng)
+    if plan.loads.sequence == "sobol" and ramp * plan.ramp in data.split_draws("train"):
+        point = sobol_point(plan.loads, plan.ramp, ramp, plan.seed)
+        load, sizes = draw_load(data.body, data.shapes, plan.loads, QuasiRandom(point)), point[-plan.ramp :]
+    else:
+        load, sizes = draw_load(data.body, data.shapes, plan.loads, rng), rng.uniform(0.0, 1.0, plan.ramp)
     if plan.loads.amplitude is not None:
         return plan.loads.amplitude * load, np.linspace(0.0, 1.0, plan.ramp + 1)[1:]
     top = data.header["amplitude"] / _peak(data.response.apply(load[None, data.response.loaded])[0])
-    return top * load, np.sort(rng.uniform(0.0, 1.0, plan.ramp))
+    return top * load, np.sort(sizes)
 
 
 def _solve_ramp(data: DataSet, plan: Plan, problem: Problem, ramp: int) -> Iterator[dict[str, Any]]:

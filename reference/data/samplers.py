@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import qmc
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import outer, outer_nodes
@@ -27,6 +28,8 @@ class LoadPlan:
         radius: smallest and largest radius of a patch, relative to the size of its zone.
         displacement: largest nodal displacement wanted, metres: the top of the range that the loads are scaled to.
         amplitude: force that multiplies a load, newtons; given, it replaces the scaling to a displacement.
+        sequence: `random`, or `sobol` for training draws that fill the space of modal loads more evenly (a scrambled
+            Sobol sequence; Owen 1998); what is held out stays random.
     """
 
     kind: Literal["modal", "random"] = "modal"
@@ -36,16 +39,68 @@ class LoadPlan:
     radius: tuple[float, float] = (0.06, 0.65)
     displacement: float = 0.05
     amplitude: float | None = None
+    sequence: Literal["random", "sobol"] = "random"
 
     def __post_init__(self) -> None:
         if self.kind not in ("modal", "random"):
             raise ValueError(f"LoadPlan.kind: expected 'modal' or 'random', got {self.kind!r}.")
+        if self.sequence not in ("random", "sobol"):
+            raise ValueError(f"LoadPlan.sequence: expected 'random' or 'sobol', got {self.sequence!r}.")
+        if self.sequence == "sobol" and self.kind != "modal":
+            raise ValueError("LoadPlan.sequence: expected 'random' for loads that are independent at each node.")
         if self.modes < 1 or self.patches < 1:
             raise ValueError(f"LoadPlan: expected at least one mode and one patch, got {self.modes}, {self.patches}.")
         if not 0.0 < self.radius[0] <= self.radius[1]:
             raise ValueError(f"LoadPlan.radius: expected 0 < smallest <= largest, got {self.radius}.")
         if not self.displacement > 0.0:
             raise ValueError(f"LoadPlan.displacement: expected a positive length in metres, got {self.displacement}.")
+
+
+class Chance(Protocol):
+    """Where draws come from: numpy's generator, or a point of a sequence."""
+
+    def integers(self, low: int, high: int | None = None) -> Any:
+        """A whole number from low (or 0) to below high (or low)."""
+
+    def uniform(self, low: float, high: float, size: Any = None) -> Any:
+        """Numbers from low to high."""
+
+
+class QuasiRandom:
+    """One point of a sequence in [0, 1)^d in a generator's place: each call takes its next coordinates.
+
+    Args:
+        point: its coordinates, (d,).
+    """
+
+    def __init__(self, point: Floats) -> None:
+        self._rest = iter(point.tolist())
+
+    def integers(self, low: int, high: int | None = None) -> int:
+        """A whole number from low (or 0) to below high (or low)."""
+        first, end = (0, low) if high is None else (low, high)
+        return first + int((end - first) * next(self._rest))
+
+    def uniform(self, low: float, high: float, size: int | None = None) -> Any:
+        """Numbers from low to high."""
+        if size is None:
+            return low + (high - low) * next(self._rest)
+        return np.array([low + (high - low) * next(self._rest) for _ in range(size)])
+
+
+def sobol_point(plan: LoadPlan, more: int, number: int, seed: int) -> Floats:
+    """A point of the scrambled Sobol sequence that a load is drawn from, and so many further coordinates behind it.
+
+    Args:
+        plan: how loads are drawn.
+        more: coordinates at the end that no load takes.
+        number: of the point, from 0.
+        seed: of the scrambling.
+    """
+    size = 1 + plan.patches * (3 + plan.modes) + more
+    sequence = qmc.Sobol(size, seed=seed)
+    point: Floats = sequence.fast_forward(number).random(1)[0] if number else sequence.random(1)[0]
+    return point
 
 
 def check_loads(body: Body, plan: LoadPlan) -> None:
@@ -95,7 +150,7 @@ def loaded_nodes(body: Body, plan: LoadPlan) -> Ints:
     return nodes
 
 
-def draw_load(body: Body, shapes: Floats, plan: LoadPlan, rng: np.random.Generator) -> Floats:
+def draw_load(body: Body, shapes: Floats, plan: LoadPlan, rng: Chance) -> Floats:
     """One unscaled load, (n, 3): the sum of modal (or random) forces on one to `plan.patches` patches.
 
     Args:
@@ -120,7 +175,7 @@ def draw_load(body: Body, shapes: Floats, plan: LoadPlan, rng: np.random.Generat
     return forces
 
 
-def _draw_patch(body: Body, plan: LoadPlan, rng: np.random.Generator) -> Ints:
+def _draw_patch(body: Body, plan: LoadPlan, rng: Chance) -> Ints:
     """Vertices of a zone in a ball of random centre and radius; never empty, for the centre is one of them."""
     zone = loaded_nodes(body, plan)
     if plan.zones:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import qmc
 
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
@@ -22,7 +23,7 @@ from softtwin.meshes.shapes import beam
 from softtwin.reference.data import dataset
 from softtwin.reference.data.dataset import SPLITS, DataSet, DataSetError, drop_block, probe_cotangents
 from softtwin.reference.data.part import Part, at_work_on
-from softtwin.reference.data.samplers import LoadPlan
+from softtwin.reference.data.samplers import LoadPlan, QuasiRandom, sobol_point
 from softtwin.reference.generate import DamagedBlock, Plan, generate, linear_response, solve_block
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 
@@ -303,6 +304,44 @@ def test_parts_that_are_none_are_refused(words: str) -> None:
 def test_a_part_throws_nothing_away(undisturbed: DataSet, others: dict) -> None:
     with pytest.raises(DataSetError, match=r"generate\.part: expected no blocks to redo and nothing to throw away"):
         generate(undisturbed.path, body(), PLAN, part=Part(0, 2), **others)
+
+
+# ---------------------------------------------------------------------- Sobol draws
+
+
+def test_sobol_draws_are_even_and_leave_what_is_held_out_alone(undisturbed: DataSet, tmp_path: Path) -> None:
+    """The sums of the loads, which the drawn coefficients are behind, leave smaller gaps than random ones do."""
+    plan = replace(PLAN, loads=replace(PLAN.loads, sequence="sobol"))
+    made = generate(tmp_path / "data.zarr", body(), plan)
+    np.testing.assert_array_equal(made.samples("test").forces, undisturbed.samples("test").forces)
+    assert not np.array_equal(made.samples("train").forces, undisturbed.samples("train").forces)
+    points = np.stack([sobol_point(plan.loads, 1, number, plan.seed) for number in range(128)])
+    chance = np.random.default_rng(0).random(points.shape)
+    assert points.shape == (128, 1 + 9 + 1) and points.min() >= 0.0 and points.max() < 1.0
+    assert qmc.discrepancy(points) < 0.5 * qmc.discrepancy(chance)
+    again = generate(tmp_path / "again.zarr", body(), plan, part=Part(1, 3))
+    assert again is not None
+    assert_same(made, generate(tmp_path / "again.zarr", body(), plan))
+    with pytest.raises(DataSetError, match=r"differs in loads\.sequence \(None there, sobol here\)"):
+        generate(undisturbed.path, body(), plan)
+
+
+def test_a_point_of_a_sequence_draws_in_its_range() -> None:
+    chance = QuasiRandom(np.array([0.0, 0.999999, 0.5, 0.25, 0.75]))
+    assert [chance.integers(1, 4), chance.integers(3), chance.uniform(2.0, 4.0)] == [1, 2, 3.0]
+    np.testing.assert_allclose(chance.uniform(-1.0, 1.0, 2), [-0.5, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"sequence": "halton"}, r"LoadPlan\.sequence: expected 'random' or 'sobol', got 'halton'"),
+        ({"kind": "random", "sequence": "sobol"}, r"LoadPlan\.sequence: expected 'random' for loads"),
+    ],
+)
+def test_sequences_that_cannot_be_are_refused(entries: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        LoadPlan(**entries)
 
 
 FAILING = """
