@@ -106,6 +106,53 @@ def generate(configuration: Path, redo: tuple[int, ...], again: bool, part: str 
         click.echo(f"written to {data.path}")
 
 
+@softtwin.group("data")
+def data_commands() -> None:
+    """Look into data sets, take samples out of them, put several together."""
+
+
+@data_commands.command("show")
+@click.argument("source", type=_EXISTING)
+def show_data(source: Path) -> None:
+    """Say what is in SOURCE, a data set or a configuration: counts, reasons, distributions, origin, damage."""
+    from softtwin.reference.data.summary import summary
+
+    from .data import opened
+
+    click.echo(summary(opened(source)))
+
+
+@data_commands.command("export")
+@click.argument("source", type=_EXISTING)
+@click.argument("output", type=_PATH)
+@click.option("--draw", "draws", multiple=True, type=int, help="Number of a draw (may be repeated).")
+def export_data(source: Path, output: Path, draws: tuple[int, ...]) -> None:
+    """Write draws of SOURCE into OUTPUT (VTU, PNG): those that move least, most and in the median, or --draw."""
+    from softtwin.reference.data.summary import summary
+
+    from .data import export_draws, opened
+
+    found = opened(source)
+    chosen = draws or tuple(dict.fromkeys(summary(found).extremes.values()))
+    for path in export_draws(found, chosen, output):
+        click.echo(f"written: {path}")
+
+
+@data_commands.command("merge")
+@click.argument("sources", nargs=-1, required=True, type=_EXISTING)
+@click.argument("output", type=_PATH)
+def merge_data(sources: tuple[Path, ...], output: Path) -> None:
+    """Put the draws of SOURCES, of one body and material, together in OUTPUT; what was held out stays held out."""
+    from softtwin.reference.data.merge import merge
+
+    from .data import opened
+    from .stages.generate import describe_data
+
+    merged = merge([opened(source) for source in sources], output)
+    click.echo(describe_data(merged))
+    click.echo(f"written to {merged.path}")
+
+
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
 @click.option("--fresh", is_flag=True, help="Throw earlier checkpoints away instead of going on from them.")

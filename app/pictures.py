@@ -153,6 +153,21 @@ def camera_side(body: Body) -> Floats:
     return forward + np.array([0.0, 0.0, 0.3]) + 0.3 * np.cross(forward, [0.0, 0.0, 1.0])
 
 
+def moved_layers(body: Body, displacement: Floats, limit: float) -> list[Layer]:
+    """The deformed body coloured by its displacement, and its outline at rest.
+
+    Args:
+        body: the body.
+        displacement: (n, 3), metres.
+        limit: displacement at the end of the colours, metres.
+    """
+    outside = outer(body)
+    at_rest, moved = outside.rest, outside.moved(displacement)
+    sizes = np.linalg.norm(moved.points - at_rest.points, axis=1)
+    coloured = Layer(moved.points, moved.triangles, values=sizes, limit=limit)
+    return [coloured, Layer(at_rest.points, at_rest.triangles, "#8a929c", style="outline")]
+
+
 def rendering_problem() -> str:
     """Why pictures cannot be drawn on this machine, empty if they can."""
     try:

@@ -7,7 +7,7 @@ import platform
 import re
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path, PurePath
 from typing import Any
@@ -39,6 +39,7 @@ from .pictures import (
     chart,
     inner_colours,
     is_tumour,
+    moved_layers,
     rendering_problem,
     view_of,
 )
@@ -324,14 +325,11 @@ def _prediction(studio: Studio, body: Body, name: str, true: Floats, predicted: 
 
 def _coloured(body: Body, field: Floats, limit: float, errors: Floats | None) -> list[Layer]:
     """The deformed body coloured by its displacement, or by the errors if given, and its outline at rest."""
-    outside = outer(body)
-    at_rest, moved = outside.rest, outside.moved(field)
-    rest = Layer(at_rest.points, at_rest.triangles, "#8a929c", style="outline")
+    coloured, rest = moved_layers(body, field, limit)
     if errors is None:
-        sizes = np.linalg.norm(moved.points - at_rest.points, axis=1)
-        return [Layer(moved.points, moved.triangles, values=sizes, limit=limit), rest]
-    values = outside.carried(errors)
-    return [Layer(moved.points, moved.triangles, values=values, limit=float(errors.max()), colours=_ERROR), rest]
+        return [coloured, rest]
+    values = outer(body).carried(errors)
+    return [replace(coloured, values=values, limit=float(errors.max()), colours=_ERROR), rest]
 
 
 def _draw_errors(sheet: Figure, sizes: Floats, errors: Floats) -> None:

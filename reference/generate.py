@@ -218,7 +218,15 @@ def _unfinished(present: DataSet, redo: Sequence[int], part: Part | None) -> lis
     if wrong:
         raise DataSetError(f"generate.redo: expected numbers of blocks in 0..{count - 1}, got {wrong}.")
     _ = present.response, present.shapes  # damage to what no block holds is found here
+    if redo and present.header.get("merged"):
+        raise DataSetError(
+            f"generate.redo: {present.path} was merged from others; make the block again in its own set."
+        )
     damaged = present.damaged_blocks([block for block in range(count) if part is None or part.has(block)])
+    if present.header.get("merged") and (damaged or present.missing_blocks()):
+        raise DataSetError(
+            f"generate.path: {present.path} was merged from others and lacks blocks, or has damaged ones; merge again."
+        )
     for block, damage in damaged.items():
         warnings.warn(f"block {block} in {present.path} {damage}; it is made again.", DamagedBlock, stacklevel=2)
     for block in {*redo, *damaged}:

@@ -225,6 +225,11 @@ class DataSet:
             **{name: group[name][part][kept] for name in schema.FIELDS},
         )
 
+    def rows(self, draws: range) -> dict[str, NDArray[Any]]:
+        """Everything that is stored of draws, rejected ones too, by name; not checked (see `check_complete`)."""
+        group = self._root["samples"]
+        return {name: group[name][draws.start : draws.stop] for name in schema.NAMES}
+
     def accepted(self, draws: Ints) -> Iterator[tuple[int, Floats]]:
         """Numbers and displacements, (n, 3), metres, of those of some draws that were accepted."""
         group = self._root["samples"]

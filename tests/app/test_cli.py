@@ -47,7 +47,20 @@ def cap(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(
     "command",
-    ["", "build", "register", "generate", "mesh", "train", "validate", "report", "quickstart", "doctor", "config"],
+    [
+        "",
+        "data",
+        "build",
+        "register",
+        "generate",
+        "mesh",
+        "train",
+        "validate",
+        "report",
+        "quickstart",
+        "doctor",
+        "config",
+    ],
 )
 def test_help_reads(capsys, command: str) -> None:
     text = run(capsys, *command.split(), "--help")

@@ -1,0 +1,121 @@
+"""Several data sets of one body and material as one: what was solved elsewhere, or later, is learned from together."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .dataset import SPLITS, DataSet, DataSetError, Split, create, stored_plan, write_block
+
+_SAME = ("material", "young_modulus", "poisson_ratio")
+
+
+def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
+    """A data set with all draws of others, split by split: what was held out stays held out.
+
+    Its plan is the first one's, with the samples of all; it cannot be gone on with. Jacobians are not taken along:
+    `generate` makes them again.
+
+    Args:
+        sources: at least two, complete, of one body, one material and the same modes.
+        path: folder to make.
+
+    Raises:
+        DataSetError: something is there already, sets that do not belong together, a draw that is in two of them, or
+            blocks that are missing or damaged.
+    """
+    path = Path(path)
+    _check(sources, path)
+    first = sources[0]
+    block = first.header["block"]
+    counts = {split: sum(len(source.split_draws(split)) for source in sources) for split in SPLITS}
+    counts = {split: count for split, count in counts.items() if count}
+    header = {
+        **{name: entry for name, entry in first.header.items() if name not in ("format", "body", "checksums")},
+        "samples": counts,
+        "plan": {**stored_plan(first.header), "samples": counts},
+        "merged": [
+            {"identity": source.identity, "samples": source.header["samples"], "plan": source.header.get("plan", {})}
+            for source in sources
+        ],
+    }
+    partial = path.with_name(f".{path.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    made = create(partial, header, first.body, first.response, first.shapes, first.eigenvalues)
+    for split in counts:
+        number = made.split_draws(split).start // block
+        for rows in _blocks(sources, split, block):
+            write_block(partial, number, rows)
+            number += 1
+    partial.rename(path)
+    return DataSet(path)
+
+
+def _check(sources: Sequence[DataSet], path: Path) -> None:
+    if path.exists():
+        raise DataSetError(f"merge.path: expected a folder that is not there yet, found {path}.")
+    if len(sources) < 2:
+        raise DataSetError(f"merge.sources: expected at least two data sets, got {len(sources)}.")
+    first = sources[0]
+    for other in sources[1:]:
+        where = f"{other.path} and {first.path}"
+        if other.body.fingerprint != first.body.fingerprint:
+            raise DataSetError(f"merge.sources: expected one body, got {where}, which differ in nodes, cells or sets.")
+        plans = stored_plan(first.header), stored_plan(other.header)
+        wrong = [f"{name} ({plans[0].get(name)}, {plans[1].get(name)})" for name in _SAME
+                 if plans[0].get(name) != plans[1].get(name)]  # fmt: skip
+        if wrong:
+            raise DataSetError(f"merge.sources: expected one material, got {where}: {'; '.join(wrong)}.")
+        if not np.array_equal(other.response.loaded, first.response.loaded):
+            raise DataSetError(f"merge.sources: expected the same loaded nodes, got others in {where}.")
+        if other.has_gradients != first.has_gradients or not _alike(other.shapes, first.shapes):
+            raise DataSetError(
+                f"merge.sources: expected gradients for the same modes, got others in {where}; make both with the same "
+                "loads.modes, on one machine."
+            )
+    _refuse_twice(sources)
+
+
+def _alike(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=1e-9 * np.abs(one).max(initial=1e-300))
+
+
+def _refuse_twice(sources: Sequence[DataSet]) -> None:
+    """A draw of one set that another holds out, or learns from again, would be told by nobody."""
+    loads: Counter[bytes] = Counter()
+    for source in sources:
+        here = set()
+        for split in SPLITS:
+            draws = source.split_draws(split)
+            if len(draws):
+                source.check_complete(split)
+                here |= {forces.tobytes() for forces in source.rows(draws)["forces"]}
+        loads.update(here)
+    twice = sum(count > 1 for count in loads.values())
+    if twice:
+        raise DataSetError(
+            f"merge.sources: expected draws that differ, got {twice} that are in more than one set; were they made "
+            "with the same seed? Make one of them with another [samples] seed."
+        )
+
+
+def _blocks(sources: Sequence[DataSet], split: Split, size: int) -> Iterator[dict[str, NDArray[Any]]]:
+    """The rows of a split of all sources one after the other, in whole blocks; the last is filled up with its last."""
+    kept: dict[str, NDArray[Any]] = {}
+    for source in sources:
+        draws = source.split_draws(split)
+        for begin in range(draws.start, draws.stop, size):
+            rows = source.rows(range(begin, min(begin + size, draws.stop)))
+            kept = {name: np.concatenate([kept[name], values]) if kept else values for name, values in rows.items()}
+            while len(kept["reason"]) >= size:
+                yield {name: values[:size] for name, values in kept.items()}
+                kept = {name: values[size:] for name, values in kept.items()}
+    if kept and len(kept["reason"]):
+        missing = size - len(kept["reason"])
+        yield {name: np.concatenate([values, np.repeat(values[-1:], missing, axis=0)]) for name, values in kept.items()}
