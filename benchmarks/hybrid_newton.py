@@ -205,11 +205,11 @@ def figures_of(found: list[Found], truth: list[Floats | None]) -> dict[str, Any]
     }
 
 
-def truth_of(body: str, problem: Problem, loads: dict[str, Floats], again: bool) -> tuple[dict[str, list[Any]], Any]:
+def truth_of(body: str, problem: Problem, loads: dict[str, Floats]) -> tuple[dict[str, list[Any]], Any]:
     """States that load steps lead to, kept from run to run, and the figures of that way."""
-    path = RUNS / f"hybrid-{body}-truth.npz"
+    path = RUNS / f"hybrid-{body}-truth-{sum(map(len, loads.values()))}.npz"
     kept = path.with_suffix(".json")
-    if again or not kept.exists():
+    if not kept.exists():
         solve, states, figures = stepped_way(problem), {}, {}
         for name, part in loads.items():
             found = [solve(load) for load in part]
@@ -240,7 +240,7 @@ def main() -> None:
         network = network_of(body, data, arguments.seconds)
         loads = loads_of(data, plan, arguments.count or COUNTS[body])
         with threadpool_limits(1), Problem(data.body, plan.build_material()) as problem:
-            truth, stepped = truth_of(body, problem, loads, arguments.count is not None)
+            truth, stepped = truth_of(body, problem, loads)
             ways = {
                 "full steps from rest (algorithm 4)": printed_way(problem, None),
                 "algorithm 5 as printed": printed_way(problem, network),
