@@ -23,6 +23,7 @@ from softtwin.app.cli import main
 from softtwin.app.config import Config, ConfigError, to_toml
 from softtwin.app.doctor import available_cores
 from softtwin.app.stages.learn import train_stage
+from softtwin.app.twin import Twin
 from softtwin.app.workspace import locked, open_workspace, read_records, timed
 from softtwin.meshes.body import Body, BodyError
 from softtwin.meshes.clouds import partial_view
@@ -31,6 +32,8 @@ from softtwin.meshes.files import read_body, write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.jacobians import stored_modes
+from softtwin.surrogate.calibration import CalibrationWarning
+from softtwin.surrogate.signs import CalibrationError
 
 ENTRIES = {
     "folder": ".",
@@ -437,3 +440,41 @@ def test_a_body_that_the_network_cannot_learn_on_is_refused_before_anything_is_s
 )
 def test_jacobians_are_wanted_where_the_network_learns_from_them(samples: Any, training: Any, wanted: bool) -> None:
     assert config(samples=samples, training=training).wants_jacobians is wanted
+
+
+def test_a_twin_says_how_wrong_it_may_be(capsys, tmp_path: Path) -> None:
+    """Bounds in the card, held against held-out samples by `validate`, and given for a prediction from Python."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    write_files(folder, bar())
+    text = build(folder, samples={"calibration": 12})
+    assert "certificate: " in text and "made for 90 %" in text
+    card = json.loads((folder / "twin" / "surrogate.json").read_text())["certificate"]
+    assert card["samples"] == 12 and set(card["held_out"]["kept"]) == {"mean", "largest"}
+    assert "certificate: " in json.loads((folder / "validation.json").read_text())["table"]
+    assert "calibration  12 accepted" in run(capsys, "data", "show", folder / "organ.toml")
+    with Twin.open(folder / "twin") as twin:
+        load = np.zeros_like(twin.body.points)
+        load[twin.model.maps.loaded, 2] = 1e-3
+        found = twin.certify(load, twin.predict(load))
+        assert 0.0 < found.mean <= found.largest < np.inf
+        assert not twin.certify(1e3 * load).is_inside
+    with (
+        Twin.open(folder / "twin", "reference") as twin,
+        pytest.raises(CalibrationError, match="a twin with a network"),
+    ):
+        twin.certify(load)
+
+
+def test_too_few_draws_for_a_bound_leave_a_twin_without_one(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    write_files(folder, bar())
+    with pytest.warns(CalibrationWarning, match=r"no bounds on its errors: .*expected at least 9 accepted samples"):
+        text = build(folder, samples={"calibration": 4})
+    assert "certificate: " not in text
+    with (
+        Twin.open(folder / "twin") as twin,
+        pytest.raises(CalibrationError, match="expected a twin that was calibrated"),
+    ):
+        twin.certify(np.zeros_like(twin.body.points))
