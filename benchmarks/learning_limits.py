@@ -12,7 +12,6 @@ import argparse
 import json
 from typing import Any
 
-import numpy as np
 from networks_bodies import data_of
 from record import RESULTS, write
 
