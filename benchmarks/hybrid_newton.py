@@ -4,8 +4,8 @@
 
 Half of the loads are drawn like those that were learned (and are none of them), half are up to twice as large. A
 failure counts at the time it took. Every state found is compared with the one that 20 load steps lead to from rest.
-Each row is written as it is finished; the same command goes on. Data and networks are made under benchmarks/runs/ where
-they are not there.
+All ways solve each load in turn. What is finished is written; the same command goes on. Data and networks are made
+under benchmarks/runs/ where they are not there.
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=300.0, help="of training")
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--count", type=int, help="of loads, in place of 1,000 and 100")
-    parser.add_argument("--only", default="", help="rows that have this in their name")
+    parser.add_argument("--only", default="", help="ways that have this in their name")
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
     path = Path(RESULTS / f"{arguments.name}.json")
@@ -250,15 +250,17 @@ def main() -> None:
             }
             for name in RANGES:
                 found[f"{body}, {name}: {STEPS} load steps"] = stepped[name]
-            for label, solve in ways.items():
-                for name in RANGES:
-                    key = f"{body}, {name}: {label}"
-                    if key in found or arguments.only not in key:
-                        continue
+            for name in RANGES:
+                wanted = {label: solve for label, solve in ways.items() if f"{body}, {name}: {label}" not in found}
+                wanted = {label: solve for label, solve in wanted.items() if arguments.only in label}
+                for solve in wanted.values():
                     solve(loads[name][0])  # what is factored once
-                    found[key] = figures_of([solve(load) for load in loads[name]], truth[name])
-                    write(path.stem, found)
+                taken = [{label: solve(load) for label, solve in wanted.items()} for load in loads[name]]  # in turn
+                for label in wanted:
+                    key = f"{body}, {name}: {label}"
+                    found[key] = figures_of([each[label] for each in taken], truth[name])
                     print(key, found[key], flush=True)
+                write(path.stem, found)
 
 
 if __name__ == "__main__":

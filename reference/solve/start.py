@@ -73,13 +73,16 @@ class Starts:
             yield Start(near, "guess", may_leave=False)
             if not fallback:
                 return
-        starts = [Start(self._first_guess(load), "linear response")]
+        first, merit = self._first_guess(load)
+        starts = [Start(first, "linear response")]
         if near is not None and not is_trusted:
             starts.append(Start(near, "guess"))
         if proposal is not None:
             starts.append(Start(self._lifted(proposal, load, "proposal"), "proposal"))
         if len(starts) > 1:
-            starts.sort(key=lambda start: self._merit(start.unknowns, load))
+            merits = [self._merit(first, load) if merit is None else merit]
+            merits += [self._merit(start.unknowns, load) for start in starts[1:]]
+            starts = [starts[place] for place in np.argsort(merits, kind="stable")]
         yield from starts
         if fallback and not self._has_lift(load):
             yield Start(np.zeros_like(load.dead), "rest")
@@ -124,18 +127,19 @@ class Starts:
     def _has_lift(self, load: DiscreteLoad) -> bool:
         return self._space.dot(load.lift, load.lift) > 0.0
 
-    def _first_guess(self, load: DiscreteLoad) -> Floats:
+    def _first_guess(self, load: DiscreteLoad) -> tuple[Floats, float | None]:
+        """Where to start from, and its merit if that is known."""
         linear = self._linear_response(load)
         if self._system.material.is_linear:
-            return linear
+            return linear, None
         if self._space.mixed:
-            return self.extended(load)
+            return self.extended(load), None
         if self._has_lift(load):
-            return self._warped(linear, load)
+            return self._warped(linear, load), None
         return self._lowest(linear, load)
 
-    def _lowest(self, linear: Floats, load: DiscreteLoad) -> Floats:
-        """Of rest and the warped responses to parts of the load, the one of least energy.
+    def _lowest(self, linear: Floats, load: DiscreteLoad) -> tuple[Floats, float]:
+        """Of rest and the warped responses to parts of the load, the one of least energy, and that energy.
 
         Under the whole load of the liver's tools the response strains the cells beside them so much that its energy is
         above that of rest; the response to a quarter or a half still saves two thirds of the factorisations.
@@ -148,7 +152,7 @@ class Starts:
                 best, lowest = start, energy
             elif lowest < 0.0:
                 break
-        return best
+        return best, lowest
 
     def _linear_response(self, load: DiscreteLoad) -> Floats:
         """K(0)^-1 of the dead forces, with prescribed displacements in their place."""
