@@ -26,6 +26,7 @@ Floats = NDArray[np.float64]
 _SHRINKAGE = 1.0  # of the fitted powers, in units of one sample of each sign's spread
 _A_RANGE = 50  # calibration samples that a range of its own should have
 _RANGES = 4  # of size, at most
+_USUAL = 0.99  # of the calibration samples: who is farther out of balance is set aside
 
 
 class CalibrationWarning(UserWarning):
@@ -92,7 +93,10 @@ def calibrate(
             error: [quantile(values[places == place], confidence) for place in range(len(edges) + 1)]
             for error, values in scores.items()
         },
-        "limits": {name: _largest([getattr(signs, name) for signs in shown]) for name in ("size", "residual", "step")},
+        "limits": {
+            name: _limit([getattr(signs, name) for signs in shown], share)
+            for name, share in (("size", 1.0), ("residual", _USUAL), ("step", _USUAL))
+        },
         "rank_correlation": {
             error: float(spearmanr(rows @ powers[error], errors[error]).statistic) for error in ERRORS
         },
@@ -227,6 +231,9 @@ def quantile(scores: Floats, confidence: float) -> float | None:
     return float(np.sort(scores)[place]) if place < len(scores) else None
 
 
-def _largest(values: list[float]) -> float:
-    finite = [value for value in values if np.isfinite(value)]
-    return max(finite) if finite else 0.0
+def _limit(values: list[float], share: float) -> float:
+    """What so large a share of the values stays below; those that are not finite lie above all."""
+    ordered = np.sort(np.where(np.isfinite(values), values, np.inf))
+    found = float(ordered[min(len(ordered) - 1, int(np.ceil(share * len(ordered))) - 1)])
+    finite = ordered[np.isfinite(ordered)]
+    return found if np.isfinite(found) else float(finite[-1]) if len(finite) else 0.0

@@ -94,7 +94,7 @@ class Certifier:
         if signs.size > limits["size"]:
             found.append(f"it moves a node by {1e3 * signs.size:.3g} mm, more than any calibrated load")
         if limits["residual"] < signs.residual < np.inf:
-            found.append(f"forces of {signs.residual:.3g} times the load are out of balance, more than ever before")
+            found.append(f"forces of {signs.residual:.3g} times the load are out of balance, more than is usual")
         if limits["step"] < signs.step < np.inf:
-            found.append(f"balance is {1e3 * signs.step:.3g} mm away, farther than ever before")
+            found.append(f"balance is {1e3 * signs.step:.3g} mm away, farther than is usual")
         return found
