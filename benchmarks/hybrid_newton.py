@@ -130,6 +130,12 @@ def printed_way(problem: Problem, network: Surrogate | None) -> Way:
     return solve
 
 
+def alone(problem: Problem, solve: Way, load: Floats) -> Found:
+    """What a way makes of a load when nothing of the way before it is left."""
+    problem.system.tangent.assemble_at_rest()
+    return solve(load)
+
+
 def stepped_way(problem: Problem) -> Way:
     """As many equal load steps, each from the one before: the state that every other way is held against."""
 
@@ -255,7 +261,9 @@ def main() -> None:
                 wanted = {label: solve for label, solve in wanted.items() if arguments.only in label}
                 for solve in wanted.values():
                     solve(loads[name][0])  # what is factored once
-                taken = [{label: solve(load) for label, solve in wanted.items()} for load in loads[name]]  # in turn
+                taken = [
+                    {label: alone(problem, solve, load) for label, solve in wanted.items()} for load in loads[name]
+                ]
                 for label in wanted:
                     key = f"{body}, {name}: {label}"
                     found[key] = figures_of([each[label] for each in taken], truth[name])

@@ -160,11 +160,12 @@ class Surrogate:
         loads = load.ravel()[self.rows]
         return SurrogateState(self, self.maps.encoded(loads), self.maps.linear(loads))
 
-    def propose(self, forces: ArrayLike) -> Floats:
+    def propose(self, forces: ArrayLike, linear: Floats | None = None) -> Floats:
         """The displacement alone, (n, 3), metres, in single precision and half of the time: for Newton to start from.
 
         Args:
             forces: nodal forces, (n, 3), newtons.
+            linear: linear response to them, (n, 3), metres, where the caller has it: to read one's own costs most.
 
         Raises:
             ValueError: as `solve`.
@@ -173,7 +174,9 @@ class Surrogate:
         self._refuse_idle("forces", np.abs(load).max(axis=1))
         loads, maps = load.ravel()[self.rows].astype(np.float32), self._rounded
         values = self.single.linearised(torch.from_numpy(maps.encoded(loads))).values.numpy()
-        return np.float64(maps.offset + maps.linear(loads) + maps.decoded(values)).reshape(-1, 3)
+        known = linear is not None and maps.left.shape[1] > 0
+        rest = linear.ravel() if known and linear is not None else maps.linear(loads)
+        return np.float64(maps.offset + rest + maps.decoded(values)).reshape(-1, 3)
 
     @cached_property
     def _rounded(self) -> LinearMaps:

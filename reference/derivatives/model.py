@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -39,8 +39,13 @@ class Predictor(Protocol):
     def learned_material(self) -> Mapping[str, Any] | None:
         """`material`, `young_modulus`, `poisson_ratio` that it has learned; None where that is not known."""
 
-    def propose(self, forces: ArrayLike) -> Floats:
-        """The displacement, (n, 3), metres, that is thought to balance nodal forces, (n, 3), newtons."""
+    def propose(self, forces: ArrayLike, linear: Floats | None = None) -> Floats:
+        """The displacement, (n, 3), metres, that is thought to balance nodal forces, (n, 3), newtons.
+
+        Args:
+            forces: nodal forces.
+            linear: the linear response to them, (n, 3), metres, where that is known.
+        """
 
 
 class ReferenceModel:
@@ -105,18 +110,21 @@ class ReferenceModel:
         fixed = self.loading.forces
         load = replace(self.loading, forces=given if fixed is None else given + np.asarray(fixed))
         guess = near.equilibrium if isinstance(near, ReferenceState) else None
-        proposal = self._proposal(given) if near is None else near.displacement if guess is None else None
+        proposal: Any = None
+        if near is not None and guess is None:
+            proposal = near.displacement
+        elif near is None and self.predictor is not None:
+            proposal = partial(self._proposed, self.predictor, given)
         found = self.problem.solve(
             load, guess, proposal=proposal, stability=False, fallback=self.patient or guess is None
         )
         return ReferenceState(given, found, self, self.problem.material)
 
-    def _proposal(self, forces: Floats) -> Floats | None:
-        """What the predictor says, if anything that one could start from."""
-        if self.predictor is None:
-            return None
+    @staticmethod
+    def _proposed(predictor: Predictor, forces: Floats, linear: Floats) -> Floats | None:
+        """What a predictor says, if anything that one could start from."""
         try:
-            proposal = self.predictor.propose(forces)
+            proposal = predictor.propose(forces, linear)
         except ValueError:  # forces where it has never seen any
             return None
         return proposal if np.isfinite(proposal).all() else None

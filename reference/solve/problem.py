@@ -20,7 +20,7 @@ from ..fem.fenicsx import MPI, assemble_matrix, create_matrix, form, ufl
 from ..fem.forms import DiscreteLoad
 from .continuation import in_load_steps
 from .newton import Attempt, Newton, NewtonOptions
-from .start import Starts
+from .start import Proposal, Starts
 from .system import System
 
 __all__ = ["Loading", "NewtonOptions", "Problem"]
@@ -130,7 +130,7 @@ class Problem:
         load: Loading | ArrayLike,
         guess: ArrayLike | Equilibrium | None = None,
         *,
-        proposal: ArrayLike | None = None,
+        proposal: ArrayLike | Proposal | None = None,
         stability: bool = True,
         fallback: bool = True,
         trace: bool = False,
@@ -145,8 +145,9 @@ class Problem:
             guess: displacement whose neighbour is wanted, (n, 3), metres, or another equilibrium, which is first moved
                 along its tangent by the change of the load; the warped linear response if not given.
             proposal: displacement that is thought to be near this load's equilibrium, a network's answer for instance,
-                (n, 3), metres. It stands beside the warped response: the one of less energy is tried first. Where the
-                proposal leads to a state that is no minimum, the others are tried, too.
+                (n, 3), metres, or a function that says it (or None) from the linear response, (n, 3). It stands beside
+                the warped response: the one of less energy is tried first. Where the proposal leads to a state that is
+                no minimum, the others are tried, too.
             stability: also factor the tangent at the state and count its negative pivots.
             fallback: try the other ways where the guess fails; without, a failure there (and from the warped linear
                 response, where an equilibrium is too far) is raised at once.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +17,8 @@ from .system import System
 from .tangent import factored
 
 Floats = NDArray[np.float64]
+Proposal = Callable[[Floats], Floats | None]
+"""From the linear response to a load, (n, 3), to a displacement thought to be near its equilibrium, if there is one."""
 _SHARES = (1.0, 0.5, 0.25)  # of the load whose linear response is warped for a start
 _TRUSTED = 0.9  # of the decrease that the tangent promises: less, and the warped response may be the better start
 
@@ -57,15 +59,19 @@ class Starts:
         self._rest = None
 
     def candidates(
-        self, load: DiscreteLoad, guess: ArrayLike | Equilibrium | None, proposal: ArrayLike | None, fallback: bool
+        self,
+        load: DiscreteLoad,
+        guess: ArrayLike | Equilibrium | None,
+        proposal: ArrayLike | Proposal | None,
+        fallback: bool,
     ) -> Iterator[Start]:
         """Starts for a load, the most promising first.
 
         Args:
             load: the load.
             guess: state whose neighbour is wanted: it comes first while its tangent can be trusted.
-            proposal: displacement that is thought to be near an equilibrium of this load, whichever: it competes with
-                the warped linear response, and the one of less energy comes first.
+            proposal: displacement that is thought to be near an equilibrium of this load, whichever, or a function that
+                says it: it competes with the warped linear response, and the one of less energy comes first.
             fallback: also rest, and what comes after a guess that is near.
         """
         near, is_trusted = (None, False) if guess is None else self._near(guess, load)
@@ -73,12 +79,14 @@ class Starts:
             yield Start(near, "guess", may_leave=False)
             if not fallback:
                 return
-        first, merit = self._first_guess(load)
+        linear = self._linear_response(load)
+        first, merit = self._first_guess(linear, load)
         starts = [Start(first, "linear response")]
         if near is not None and not is_trusted:
             starts.append(Start(near, "guess"))
-        if proposal is not None:
-            starts.append(Start(self._lifted(proposal, load, "proposal"), "proposal"))
+        proposed = proposal(self._space.field(linear)) if callable(proposal) else proposal
+        if proposed is not None:
+            starts.append(Start(self._lifted(proposed, load, "proposal"), "proposal"))
         if len(starts) > 1:
             merits = [self._merit(first, load) if merit is None else merit]
             merits += [self._merit(start.unknowns, load) for start in starts[1:]]
@@ -127,9 +135,8 @@ class Starts:
     def _has_lift(self, load: DiscreteLoad) -> bool:
         return self._space.dot(load.lift, load.lift) > 0.0
 
-    def _first_guess(self, load: DiscreteLoad) -> tuple[Floats, float | None]:
+    def _first_guess(self, linear: Floats, load: DiscreteLoad) -> tuple[Floats, float | None]:
         """Where to start from, and its merit if that is known."""
-        linear = self._linear_response(load)
         if self._system.material.is_linear:
             return linear, None
         if self._space.mixed:

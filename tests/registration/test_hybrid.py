@@ -104,7 +104,7 @@ def test_nonsense_from_a_network_is_left_aside(problem: Problem, data: DataSet, 
     class Nonsense:
         body, learned_material = data.body, None
 
-        def propose(self, forces: np.ndarray) -> np.ndarray:
+        def propose(self, forces: np.ndarray, linear: np.ndarray | None = None) -> np.ndarray:
             return -3.0 * data.body.points if kind == "inside out" else np.full_like(data.body.points, np.nan)
 
     found = ReferenceModel(problem, predictor=Nonsense()).solve(load)
@@ -131,6 +131,18 @@ def test_a_proposal_that_is_no_minimum_is_given_up() -> None:
     with Problem(column, NeoHookean(5000.0, 0.3)) as problem:
         found = problem.solve(load, proposal=straight.displacement)
     assert found.start != "proposal"
+
+
+def test_a_proposal_takes_the_linear_response_that_is_known(
+    network: Surrogate, data: DataSet, problem: Problem
+) -> None:
+    load = next(held_out(data))
+    linear = problem.apply_inverse(load.ravel()).reshape(-1, 3)
+    expected = network.solve(load).displacement
+    largest = np.abs(expected).max()
+    np.testing.assert_allclose(network.propose(load), expected, atol=1e-6 * largest)
+    np.testing.assert_allclose(network.propose(load, linear), expected, atol=1e-6 * largest)
+    np.testing.assert_allclose(network.propose(load, 0.0 * linear), expected - linear, atol=1e-6 * largest)
 
 
 def test_a_network_of_another_body_is_refused(network: Surrogate) -> None:
