@@ -127,6 +127,43 @@ def networks(name: str) -> None:
         )
 
 
+def hybrid() -> None:
+    """Newton's method from a network's prediction: means are over all loads, failures at the time they took."""
+    found = figures("hybrid_newton")
+    if not found:
+        return
+    head("hybrid_newton", "same state", "prediction picked", "iterations; factorisations", "ms: median; mean; 95 %")
+    for key, f in found.items():
+        row(
+            key,
+            f"{f['same_state']} of {f['loads']}",
+            f"{100 * f['picked'] / f['loads']:.0f} %",
+            f"{f['iterations']:.1f}; {f['factorisations']:.2f}",
+            f"{f['median_ms']:.1f}; {f['mean_ms']:.1f}; {f['p95_ms']:.0f}",
+        )
+
+
+def certificates() -> None:
+    """Bounds on errors, by range of size from the smallest to the largest."""
+    found = figures("certificates")
+    if not found:
+        return
+    ranges = "; by size"
+    head("certificates", f"kept, mean error, %{ranges}", f"width / median error{ranges}", "rank", "outside %: 1 x; 3 x",
+         "Newton step: rank; indefinite", "ms: prediction; distance; certificate; Newton step")  # fmt: skip
+    for body, f in found.items():
+        held, ms, newton = f["held_out"], f["ms"], f["newton_step"]
+        row(
+            f"{body}: {held['samples']} loads",
+            f"{100 * held['kept']['mean']:.1f}; " + " / ".join(f"{100 * k:.1f}" for k in held["kept_in_range"]["mean"]),
+            " / ".join(f"{width:.2f}" for width in held["widths"]["mean"]),
+            f"{held['rank_correlation']['mean']:.3f}",
+            f"{100 * f['outside']['times_1']:.1f}; {100 * f['outside']['times_3']:.1f}",
+            f"{newton['rank_correlation']:.3f}; {newton['indefinite']} of {newton['samples']}",
+            "; ".join(f"{ms[name]:.2f}" for name in ("prediction", "distance", "step", "newton")),
+        )
+
+
 def main() -> None:
     for model in ("surrogate", "reference"):
         robustness(model)
@@ -136,6 +173,8 @@ def main() -> None:
     networks("networks_samples")
     networks("networks_physics")
     networks("networks_bodies")
+    hybrid()
+    certificates()
 
 
 if __name__ == "__main__":
