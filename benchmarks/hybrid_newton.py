@@ -245,7 +245,7 @@ def main() -> None:
         plan = plan_from_header(data.header)
         network = network_of(body, data, arguments.seconds)
         loads = loads_of(data, plan, arguments.count or COUNTS[body])
-        with threadpool_limits(1), Problem(data.body, plan.build_material()) as problem:
+        with threadpool_limits(1), Problem(data.body, plan.build_material(), plan.newton) as problem:
             truth, stepped = truth_of(body, problem, loads)
             ways = {
                 "full steps from rest (algorithm 4)": printed_way(problem, None),
