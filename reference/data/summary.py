@@ -45,7 +45,7 @@ class Summary:
 
     def __str__(self) -> str:
         counts = [
-            f"{split:12} " + ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+            f"{split:12} " + (", ".join(f"{count} {reason}" for reason, count in reasons.items()) or "nothing finished")
             for split, reasons in self.draws.items()
         ]
         rows = [f"{name:32} " + " ".join(f"{value:10.4g}" for value in row) for name, row in self.spread.items()]
