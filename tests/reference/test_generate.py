@@ -259,7 +259,7 @@ def test_parts_that_know_nothing_of_each_other_make_the_same_data(
 ) -> None:
     """Three at the same moment, none of which finds a data set; one of them under two ranks."""
     path = tmp_path / "data.zarr"
-    launches = [["mpirun", "--oversubscribe", "-n", "2"] if shutil.which("mpirun") else [], [], []]
+    launches = [["mpirun", "-n", "2"] if shutil.which("mpirun") else [], [], []]
     jobs = [
         subprocess.Popen([*launch, sys.executable, "-c", PROGRAM, str(path), f"{i}/3"], env=mpi_environment)
         for i, launch in enumerate(launches)
