@@ -58,13 +58,18 @@ def calibrate(
         confidence: share of loads that shall keep the bound, in (0, 1).
 
     Raises:
-        CalibrationError: too few samples (it says how many are needed), another body, or no material in the card.
+        CalibrationError: too few samples (it says how many are needed), another body or material, or none in the card.
         DataSetError: a split is not complete.
     """
     if not 0.0 < confidence < 1.0:
         raise CalibrationError(f"calibrate.confidence: expected a number in (0, 1), got {confidence}.")
     if data.body.fingerprint != surrogate.body.fingerprint:
         raise CalibrationError(f"calibrate.data: {data.path} is of another body than the surrogate.")
+    learned, plan = surrogate.learned_material or {}, data.header.get("plan", {})
+    wrong = [f"{name} ({value} learned, {plan[name]} there)" for name, value in learned.items()
+             if name in plan and plan[name] != value]  # fmt: skip
+    if wrong:
+        raise CalibrationError(f"calibrate.data: {data.path} is of another material than the surrogate: {wrong[0]}.")
     held, fitted = data.samples(split), data.samples(fitted_on)
     if len(held) < needed(confidence) or len(fitted) == 0:
         raise CalibrationError(
@@ -97,9 +102,7 @@ def calibrate(
             name: _limit([getattr(signs, name) for signs in shown], share)
             for name, share in (("size", 1.0), ("residual", _USUAL), ("step", _USUAL))
         },
-        "rank_correlation": {
-            error: float(spearmanr(rows @ powers[error], errors[error]).statistic) for error in ERRORS
-        },
+        "rank_correlation": {error: _rank(rows @ powers[error], errors[error]) for error in ERRORS},
     }
     return surrogate.with_card(certificate=entry)
 
@@ -128,7 +131,7 @@ class Coverage:
         kept_in_range: the same in each range of size; None where no sample fell.
         widths: median bound over median error in each range, likewise.
         in_range: samples in each range.
-        rank_correlation: Spearman's, of bound and error.
+        rank_correlation: Spearman's, of bound and error; None where they do not vary.
         outside: samples that the certificate sets aside; they count in all of the above.
     """
 
@@ -139,7 +142,7 @@ class Coverage:
     kept_in_range: dict[str, list[float | None]]
     widths: dict[str, list[float | None]]
     in_range: list[int]
-    rank_correlation: dict[str, float]
+    rank_correlation: dict[str, float | None]
     outside: int
 
     def as_dict(self) -> dict[str, Any]:
@@ -186,9 +189,15 @@ def coverage(surrogate: Surrogate, data: DataSet, split: Split = "test") -> Cove
         kept_in_range={error: [_mean(kept[error][some]) for some in members] for error in ERRORS},
         widths={error: [_ratio(bounds[error][some], errors[error][some]) for some in members] for error in ERRORS},
         in_range=[int(some.sum()) for some in members],
-        rank_correlation={error: float(spearmanr(bounds[error], errors[error]).statistic) for error in ERRORS},
+        rank_correlation={error: _rank(bounds[error], errors[error]) for error in ERRORS},
         outside=sum(not each.is_inside for each in given),
     )
+
+
+def _rank(bounds: Floats, errors: Floats) -> float | None:
+    if np.ptp(np.nan_to_num(bounds)) == 0.0 or np.ptp(errors) == 0.0:
+        return None
+    return float(spearmanr(bounds, errors).statistic)
 
 
 def _mean(values: NDArray[Any]) -> float | None:

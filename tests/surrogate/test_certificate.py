@@ -118,16 +118,22 @@ def test_a_saved_twin_keeps_its_certificate(surrogate: Surrogate, data: DataSet,
 # ---------------------------------------------------------------------- what they are read from
 
 
-def test_the_step_is_the_reference_s_from_the_tangent_at_rest(bare: Surrogate, data: DataSet, small: Body) -> None:
-    """Under a load so small that nothing turns."""
-    force = 1e-3 * loads(data, 1)[0]
-    state = bare.solve(force)
-    signs = SignReader(bare).read(force, state)
+@pytest.mark.parametrize(("size", "is_turned", "tolerance"), [(1e-4, False, 1e-2), (1.0, True, 1e-6)])
+def test_the_step_is_the_reference_s_from_the_tangent_at_rest(
+    bare: Surrogate, data: DataSet, small: Body, size: float, is_turned: bool, tolerance: float
+) -> None:
+    """Under a load so small that nothing turns, and under a whole one with the rotations of the nodes."""
+    import torch
+
+    force = size * loads(data, 1)[0]
+    state, reader = bare.solve(force), SignReader(bare)
+    signs = reader.read(force, state)
+    turns = reader._rotations(torch.from_numpy(state.displacement)) if is_turned else np.eye(3)[None]
     with Problem(small, PLAN.build_material()) as problem:
         gap = problem.internal_forces(state.displacement) - force
         gap[small.fixed] = 0.0
-        step = problem.apply_inverse(gap.ravel()).reshape(-1, 3)
-    np.testing.assert_allclose(signs.step, np.linalg.norm(step, axis=1).mean(), rtol=1e-2)
+        step = problem.apply_inverse((gap[:, None] @ turns).ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(signs.step, np.linalg.norm(step, axis=1).mean(), rtol=tolerance)
     np.testing.assert_allclose(signs.residual, np.linalg.norm(gap) / np.linalg.norm(force), rtol=1e-6)
     assert signs.size == np.linalg.norm(state.displacement, axis=1).max()
 
@@ -180,6 +186,12 @@ def test_data_of_another_body_are_refused(bare: Surrogate, tmp_path: Path) -> No
     )
     with pytest.raises(CalibrationError, match="is of another body"):
         calibrate(bare, other)
+
+
+def test_data_of_another_material_are_refused(bare: Surrogate, data: DataSet) -> None:
+    plan = {**bare.card["data"]["plan"], "young_modulus": 4000.0}
+    with pytest.raises(CalibrationError, match=r"another material.*young_modulus \(4000\.0 learned, 5000\.0 there\)"):
+        calibrate(bare.with_card(data={**bare.card["data"], "plan": plan}), data)
 
 
 def test_loads_drawn_otherwise_are_told(bare: Surrogate, data: DataSet) -> None:
