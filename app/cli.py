@@ -195,7 +195,13 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
 @softtwin.command()
 @click.argument("twin", type=_EXISTING)
 @click.argument("clouds", nargs=-1, required=True)
-@click.option("--model", type=click.Choice(["surrogate", "reference"]), help="Forward model.")
+@click.option(
+    "--model",
+    "--engine",
+    "model",
+    type=click.Choice(["surrogate", "reference", "hybrid"]),
+    help="Forward model; hybrid: the surrogate first, the reference from there.",
+)
 @click.option("--zone", help="Node set whose nodes may carry force; '' for all loaded nodes.")
 @click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
 @click.option("--noise", type=float, help="Noise of a point, metres, that the search for it begins with.")

@@ -119,6 +119,14 @@ class SamplesSection(_Section):
         ge=0,
         description="draws to calibrate bounds on errors with, neither learned nor chosen from; 0: no bounds",
     )
+    rounds: int = Field(
+        0,
+        ge=0,
+        description="active rounds: how often further draws to learn from are chosen, where the network trained on "
+        "those before is least in balance; 0: none",
+    )
+    chosen: Count = Field(64, description="draws chosen in each active round, in whole blocks")
+    candidates: Count = Field(16, description="loads looked at for each that is chosen")
     block: Count = Field(8, description="draws in one block of work")
     ramp: Count = Field(
         1,
@@ -137,6 +145,8 @@ class SamplesSection(_Section):
     def _ramp_divides_block(self) -> SamplesSection:
         if self.block % self.ramp:
             raise ValueError(f"samples.ramp: expected a divisor of samples.block ({self.block}), got {self.ramp}")
+        if self.rounds and self.chosen % self.block:
+            raise ValueError(f"samples.chosen: expected whole blocks of {self.block} draws, got {self.chosen}")
         return self
 
 
@@ -181,7 +191,9 @@ class TrainingSection(_Section):
 class RegistrationSection(_Section):
     """From a cloud to forces."""
 
-    model: Literal["surrogate", "reference"] = Field("surrogate", description="which forward model registers")
+    model: Literal["surrogate", "reference", "hybrid"] = Field(
+        "surrogate", description="which forward model registers; hybrid: the surrogate first, the reference from there"
+    )
     zone: str = Field("", description="zone whose nodes may carry force; empty: all loaded nodes")
     noise: Positive = Field(5e-4, description="noise of a point, metres, that the search for it begins with")
     noise_known: bool = Field(False, description="hold the noise at that value instead of finding it")

@@ -50,6 +50,7 @@ def plan_entries(config: Config) -> dict[str, Any]:
         "samples": {
             **{"train": samples.train, "validation": samples.validation, "test": samples.test},
             **({"calibration": samples.calibration} if samples.calibration else {}),
+            **({"active": samples.rounds * samples.chosen} if samples.rounds else {}),
         },
         "block": samples.block,
         "ramp": samples.ramp,

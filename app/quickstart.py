@@ -21,7 +21,7 @@ from .config import Config
 from .export import Exporter
 from .record import NOTICE, Recorder
 from .report import report_stage
-from .twin import Frame, Twin, forward_model
+from .twin import Frame, Twin, forward_models
 from .workspace import Workspace, timed
 
 Floats = NDArray[np.float64]
@@ -83,7 +83,7 @@ def demo_stage(space: Workspace, say: Callable[[str], None]) -> None:
 
 
 def _demo(space: Workspace, folder: Path, body: Body, say: Callable[[str], None]) -> None:
-    with forward_model("reference", space.twin, body, space.config) as reference:
+    with forward_models("reference", space.twin, body, space.config) as (reference, _):
         forces, zone = unseen_load(body, reference, space.config.loads.displacement)
         truth = reference.solve(forces).displacement
     cloud = partial_view(body, truth, CAMERA, POINTS, NOISE, np.random.default_rng(11), surface="observed")
@@ -93,8 +93,8 @@ def _demo(space: Workspace, folder: Path, body: Body, say: Callable[[str], None]
         say(f"    before: {name} {1e3 * error:.2f} mm away from where it is")
     held = body.with_sets(tool=zone)
     for name, (model, touched) in DEMOS.items():
-        with forward_model(model, space.twin, held, space.config) as forward:
-            result = _registered(Twin(forward, space.config), touched, cloud, truth, folder / name)
+        with forward_models(model, space.twin, held, space.config) as (forward, fast):
+            result = _registered(Twin(forward, space.config, fast=fast), touched, cloud, truth, folder / name)
         np.savez(folder / f"{name}.npz", displacement=result.displacement, forces=result.forces, true_forces=forces)
         say(f"    after, with the {name.replace('-', ' ')}: {_outcome(body, result, truth, forces)}")
 

@@ -125,6 +125,25 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "evaluations": result.evaluations,
         "solve_seconds": result.seconds,
     }
+    if result.draft is not None:  # where the two models of the hybrid engine disagree, and by how much
+        apart = np.linalg.norm(result.displacement - result.draft.displacement, axis=1)
+        row["draft"] = {
+            "verdict": result.draft.judgement.verdict.value,
+            "mean_distance_m": float(apart.mean()),
+            "largest_distance_m": float(apart.max()),
+            "node_of_largest": int(apart.argmax()),
+            "net_force_N": place.directions(result.draft.net_force).tolist(),
+            "solve_seconds": result.draft.seconds,
+        }
+    bound = twin.bounded(result)
+    if bound is not None:
+        row["network"] = {
+            "mean_error_bound_m": bound.mean,
+            "largest_error_bound_m": bound.largest,
+            "confidence": bound.confidence,
+            "is_inside": bound.is_inside,
+            "reasons": list(bound.reasons),
+        }
     moved = {name: points.displace(result.displacement) for name, points in twin.embeddings.items()}
     row["targets"] = {name: {"movement_m": _mean_length(vectors)} for name, vectors in moved.items()}
     if truth is not None:

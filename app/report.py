@@ -231,7 +231,7 @@ def data_section(space: Workspace, studio: Studio) -> Section:
         )
     rejected = data.rejected().reasons
     drawn = dict(data.header["samples"])
-    splits = [split for split in SPLITS if drawn.get(split)]
+    splits = [split for split in SPLITS if drawn.get(split) and split != "active"]  # these are among the training's
     peaks: dict[str, Floats] = {split: _peaks(data.samples(split, _MOST_DRAWS).displacements) for split in splits}
     iterations: dict[str, Ints] = {split: _iterations(data, split) for split in splits}
     return {

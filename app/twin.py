@@ -22,6 +22,7 @@ from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import loaded_nodes
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel, State
+from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import (
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+Engine = Registrar | HybridRegistrar
 Camera = Pose | PosePrior | Literal["align"] | None
 """Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
 is first looked for in the clouds themselves, None for clouds in the coordinates of the body at rest."""
@@ -83,15 +85,23 @@ class Twin:
         model: forward model.
         config: settings; `config.registration` says how clouds are registered.
         resources: what is given back when the twin is closed.
+        fast: a faster model of the same body, which registers first (the hybrid engine); None for the model alone.
     """
 
-    def __init__(self, model: ForwardModel, config: Config | None = None, resources: ExitStack | None = None) -> None:
+    def __init__(
+        self,
+        model: ForwardModel,
+        config: Config | None = None,
+        resources: ExitStack | None = None,
+        fast: ForwardModel | None = None,
+    ) -> None:
         self._model: ForwardModel | None = model
+        self._fast = fast
         self._body = model.body
         self.config = config or Config()
         self._resources = resources or ExitStack()
-        self._registrars: dict[str, Registrar] = {}
-        self._posed: tuple[str, PosePrior, Registrar] | None = None
+        self._registrars: dict[str, Engine] = {}
+        self._posed: tuple[str, PosePrior, Engine] | None = None
 
     @classmethod
     def open(cls, folder: Path | str, model: str = "", **options: Any) -> Twin:
@@ -99,7 +109,7 @@ class Twin:
 
         Args:
             folder: a twin; a folder with a body and its configuration, without a network; or a configuration file.
-            model: `surrogate` or `reference`; what the twin's configuration says if not given.
+            model: `surrogate`, `reference` or `hybrid`; what the twin's configuration says if not given.
             options: entries of the configuration's [registration] that replace what it says (`noise=1e-3`, ...).
 
         Raises:
@@ -110,7 +120,7 @@ class Twin:
 
     def close(self) -> None:
         """Give back what the model holds; the twin is of no use afterwards, nor are derivatives of its states."""
-        self._model = None  # FEniCSx ends the process that uses what was given back
+        self._model = self._fast = None  # FEniCSx ends the process that uses what was given back
         self._registrars.clear()
         self._posed = None
         self._resources.close()
@@ -162,15 +172,27 @@ class Twin:
         """
         return self._certifier.certify(forces, state)
 
+    def bounded(self, found: Registration) -> Certificate | None:
+        """How wrong the network may be about a registered state; None where there is none that was calibrated.
+
+        Of the hybrid engine it is about what the network had found.
+
+        Args:
+            found: a registration of this twin.
+        """
+        card: Any = getattr(self._fast or self.model, "card", {})
+        return self._certifier.certify((found.draft or found).forces) if card.get("certificate") else None
+
     @cached_property
     def _certifier(self) -> Certifier:
         from softtwin.surrogate.certificate import Certifier  # torch is needed here alone
         from softtwin.surrogate.model import Surrogate
         from softtwin.surrogate.signs import CalibrationError
 
-        if not isinstance(self.model, Surrogate):
-            raise CalibrationError(f"Twin.certify: expected a twin with a network, got {type(self.model).__name__}.")
-        return Certifier(self.model)
+        network = self._fast or self.model
+        if not isinstance(network, Surrogate):
+            raise CalibrationError(f"Twin.certify: expected a twin with a network, got {type(network).__name__}.")
+        return Certifier(network)
 
     def register(
         self, cloud: ArrayLike, zone: str | None = None, start: Registration | None = None, camera: Camera = None
@@ -198,7 +220,7 @@ class Twin:
         return self._posed_result(cloud, zone, camera, lambda registrar, points: registrar.follow(points, last))
 
     def _posed_result(
-        self, cloud: ArrayLike, zone: str | None, camera: Camera, run: Callable[[Registrar, Floats], Registration]
+        self, cloud: ArrayLike, zone: str | None, camera: Camera, run: Callable[[Engine, Floats], Registration]
     ) -> Registration:
         points = np.asarray(cloud, dtype=np.float64)
         if isinstance(camera, Pose):
@@ -275,7 +297,7 @@ class Twin:
             options.pose_shift,
         )
 
-    def registrar(self, zone: str | None = None, camera: PosePrior | None = None) -> Registrar:
+    def registrar(self, zone: str | None = None, camera: PosePrior | None = None) -> Engine:
         """What registers clouds with forces in a zone; prepared once (about a second), then kept.
 
         Args:
@@ -294,22 +316,33 @@ class Twin:
             self._registrars[zone] = self._prepared(zone, None)
         return self._registrars[zone]
 
-    def _prepared(self, zone: str, camera: PosePrior | None) -> Registrar:
-        body, section = self.body, self.config.registration
+    def _prepared(self, zone: str, camera: PosePrior | None) -> Engine:
+        section = self.config.registration
+
+        def posed(plain: Registrar) -> Registrar:
+            options = _options(section, options_for(plain.model, bool(zone), has_pose=True))
+            return Registrar(plain.model, plain.observed, plain.forces, options, pose=camera)
+
         if camera is not None:
             plain = self.registrar(zone)
-            options = _options(section, options_for(self.model, bool(zone), has_pose=True))
-            return Registrar(self.model, plain.observed, plain.forces, options, pose=camera)
+            if isinstance(plain, Registrar):
+                return posed(plain)
+            return HybridRegistrar(posed(plain.fast), posed(plain.exact))
+        exact = self._alone(self.model, zone)
+        return exact if self._fast is None else HybridRegistrar(self._alone(self._fast, zone), exact)
+
+    def _alone(self, model: ForwardModel, zone: str) -> Registrar:
+        body, section = self.body, self.config.registration
         if zone and zone not in body.node_sets:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
         return prepare(
-            self.model,
+            model,
             body.node_sets[zone] if zone else loaded_nodes(body, load_plan(self.config)),
             body.surfaces.get("observed"),
             force_scale=section.force_scale or expected_force(body, self.config.material.young_modulus),
             smoothness=section.smoothness,
             directions=section.directions,
-            options=_options(section, options_for(self.model, bool(zone))),
+            options=_options(section, options_for(model, bool(zone))),
         )
 
 
@@ -408,9 +441,9 @@ class Home:
     def twin(self, model: str = "", **options: Any) -> Twin:
         """The twin that is here; see `Twin.open`."""
         config = with_options(self.config, {**options, **({"model": model} if model else {})})
-        resources = ExitStack()
-        chosen = resources.enter_context(forward_model(config.registration.model, self.folder, self.body, config))
-        return Twin(chosen, config, resources)
+        with ExitStack() as opened:
+            both = opened.enter_context(forward_models(config.registration.model, self.folder, self.body, config))
+            return Twin(both[0], config, opened.pop_all(), both[1])
 
 
 def find_twin(place: Path | str) -> Home:
@@ -442,19 +475,23 @@ def find_twin(place: Path | str) -> Home:
 
 
 @contextmanager
-def forward_model(name: str, folder: Path, body: Body, config: Config) -> Iterator[ForwardModel]:
-    """The forward model that registers: the twin's surrogate, or the reference where FEniCSx is installed.
+def forward_models(
+    name: str, folder: Path, body: Body, config: Config
+) -> Iterator[tuple[ForwardModel, ForwardModel | None]]:
+    """The forward model that registers, and a faster one that registers first where the engine is hybrid.
 
     Args:
-        name: `surrogate` or `reference`.
+        name: `surrogate`, `reference` (where FEniCSx is installed) or `hybrid`.
         folder: the twin.
         body: its body.
         config: its configuration; gives the reference its material.
 
     Raises:
         ConfigError: there is no surrogate.
+        ValueError: a surrogate of another material than the configuration's.
     """
-    if name == "surrogate":
+    network = None
+    if name != "reference":
         if not (folder / "surrogate.json").is_file():
             raise ConfigError(
                 f"twin: expected a surrogate in {folder}, found no surrogate.json; train one with `softtwin build`, "
@@ -462,7 +499,10 @@ def forward_model(name: str, folder: Path, body: Body, config: Config) -> Iterat
             )
         from softtwin.surrogate.twin import load  # torch is needed here alone
 
-        yield load(folder, body)
+        network = load(folder, body)
+    if name == "surrogate":
+        assert network is not None
+        yield network, None
         return
     from softtwin.reference.data.materials import MATERIALS
     from softtwin.reference.derivatives.model import ReferenceModel  # FEniCSx is needed here alone
@@ -470,4 +510,4 @@ def forward_model(name: str, folder: Path, body: Body, config: Config) -> Iterat
 
     material = MATERIALS[config.material.law](config.material.young_modulus, config.material.poisson_ratio)
     with Problem(body, material, NewtonOptions(tolerance=1e-5, max_iterations=15)) as problem:
-        yield ReferenceModel(problem, patient=False)
+        yield ReferenceModel(problem, patient=False, predictor=network), network

@@ -24,6 +24,7 @@ from tqdm import tqdm
 from softtwin.meshes.body import Body
 
 from .data.dataset import (
+    NEEDED,
     SPLITS,
     DataSet,
     DataSetError,
@@ -42,10 +43,11 @@ from .data.outcome import Equilibrium, NotConverged
 from .data.part import Part, at_work_on, refuse_parts_at_work
 from .data.samplers import LoadPlan, QuasiRandom, check_loads, draw_load, loaded_nodes, sobol_point
 from .data.schema import Reason
-from .farm import quiet, share_out
+from .farm import Task, quiet, share_out
 from .fem.fenicsx import MPI, PETSc, dolfinx
 from .modes import eigenmodes
 from .ranks import on_first
+from .solve.predictor import Predictor, check_predictor, proposal_for
 from .solve.problem import NewtonOptions, Problem
 
 Floats = NDArray[np.float64]
@@ -69,7 +71,8 @@ class Plan:
         young_modulus: pascals.
         poisson_ratio: in [0, 0.5).
         loads: how loads are drawn.
-        samples: draws of each split; `calibration` may be left out.
+        samples: draws of each split; `calibration` may be left out, and so may `active`: whole blocks of draws that are
+            learned from, too, once `write_chosen` has said which of the `candidate_loads` they are.
         block: draws of one block, the unit of work and of storage.
         ramp: draws that share one load at growing sizes, each solved from the one before; divides `block`. Several
             times cheaper a draw than independent loads where these need many Newton iterations from rest.
@@ -90,14 +93,18 @@ class Plan:
     def __post_init__(self) -> None:
         if self.material not in MATERIALS:
             raise ValueError(f"Plan.material: expected one of {sorted(MATERIALS)}, got {self.material!r}.")
-        *always, optional = SPLITS
-        if set(self.samples) - {optional} != set(always) or min(self.samples.values()) < 1:
+        may = set(SPLITS) - set(NEEDED)
+        if set(self.samples) - may != set(NEEDED) or min(self.samples.values()) < 1:
             raise ValueError(
-                f"Plan.samples: expected at least one draw for each of {always} (and of {optional}, or no word of it), "
-                f"got {dict(self.samples)}."
+                f"Plan.samples: expected at least one draw for each of {NEEDED} (and of {sorted(may)}, or no word of "
+                f"them), got {dict(self.samples)}."
             )
         if self.block < 1:
             raise ValueError(f"Plan.block: expected at least 1, got {self.block}.")
+        if self.samples.get("active", 0) % self.block:
+            raise ValueError(
+                f"Plan.samples: expected whole blocks of {self.block} active draws, got {self.samples['active']}."
+            )
         if self.ramp < 1 or self.block % self.ramp:
             raise ValueError(f"Plan.ramp: expected a divisor of the block ({self.block}), got {self.ramp}.")
         self.build_material()
@@ -126,12 +133,13 @@ def generate(
     redo: Sequence[int] = (),
     again: bool = False,
     part: Part | None = None,
+    task: Task | None = None,
 ) -> DataSet | None:
     """Make a data set, or go on with one that was interrupted; collective over the communicator.
 
     With one rank the blocks are solved one after the other. With more, rank 0 hands blocks out by `mpi4py.futures`
     and solves blocks itself meanwhile. The data do not depend on the number of ranks. Blocks that are damaged are
-    made again, with a warning that names them.
+    made again, with a warning that names them. Blocks of active draws that nobody has chosen yet are left.
 
     Args:
         path: folder of the data set; as body and plan read on rank 0 alone, the others may give None.
@@ -142,6 +150,7 @@ def generate(
         again: throw away what is there.
         part: solve the blocks of one part alone, beside other jobs that solve the others; the first to come prepares
             the data set.
+        task: what solves a block, in place of `solve_block`; read on rank 0 alone.
 
     Returns:
         The data set on rank 0, None on the others.
@@ -165,7 +174,7 @@ def generate(
             return Path(path), _prepare(Path(path), body, plan, redo, again)
 
         folder, blocks = on_first(comm, prepare) or (None, [])
-        share_out(solve_block, str(comm.bcast(folder, root=0)), blocks, comm, "solving")
+        share_out(task or solve_block, str(comm.bcast(folder, root=0)), blocks, comm, "solving")
     return DataSet(folder) if folder is not None else None
 
 
@@ -209,7 +218,7 @@ def _prepare(
         "amplitude": amplitude,
         "versions": versions(),
     }
-    return create(path, header, body, response, modes.shapes, modes.eigenvalues).missing_blocks()
+    return _solvable(create(path, header, body, response, modes.shapes, modes.eigenvalues))
 
 
 def _unfinished(present: DataSet, redo: Sequence[int], part: Part | None) -> list[int]:
@@ -231,7 +240,15 @@ def _unfinished(present: DataSet, redo: Sequence[int], part: Part | None) -> lis
         warnings.warn(f"block {block} in {present.path} {damage}; it is made again.", DamagedBlock, stacklevel=2)
     for block in {*redo, *damaged}:
         drop_block(present.path, block)
-    return present.missing_blocks()
+    return _solvable(present)
+
+
+def _solvable(data: DataSet) -> list[int]:
+    """Blocks that are missing and whose draws are known."""
+    size, ramp = data.header["block"], stored_plan(data.header).get("ramp", 1)
+    first, unknown = data.split_draws("active").start, np.flatnonzero(data.chosen < 0)
+    waiting = {(first + ramp * int(place)) // size for place in unknown}
+    return [block for block in data.missing_blocks() if block not in waiting]
 
 
 def _plain(plan: Plan) -> dict[str, Any]:
@@ -390,17 +407,24 @@ def _opened(path: str, made: int) -> tuple[DataSet, Plan, Problem]:
     return data, plan, Problem(data.body, plan.build_material(), plan.newton)
 
 
-def solve_block(path: str, block: int) -> int:
+def solve_block(path: str, block: int, predictor: Predictor | None = None) -> int:
     """Draw, solve and write one block of a prepared data set; returns its number.
 
     Args:
         path: folder of the data set.
         block: number of the block.
+        predictor: says where to start each solve, the network of an earlier round for instance; the equilibria are
+            those that are found without, to the solver's tolerance.
+
+    Raises:
+        ValueError: a predictor of another body or material.
     """
     data, plan, problem = opened(path)
+    if predictor is not None:
+        check_predictor(predictor, problem)
     with threadpool_limits(1):
         ramps = range(block * plan.block // plan.ramp, (block + 1) * plan.block // plan.ramp)
-        rows = [row for number in ramps for row in _solve_ramp(data, plan, problem, number)]
+        rows = [row for number in ramps for row in _solve_ramp(data, plan, problem, number, predictor)]
     write_block(Path(path), block, {name: np.stack([row[name] for row in rows]) for name in rows[0]})
     return block
 
@@ -411,21 +435,51 @@ def ramp_loads(data: DataSet, plan: Plan, ramp: int) -> tuple[Floats, Floats]:
     Args:
         data: gives body, modes, linear response and calibrated amplitude.
         plan: what is generated.
-        ramp: number of the ramp; everything is a function of it and the seed.
+        ramp: number of the ramp; everything is a function of it and the seed, and of an active one's candidate.
+
+    Raises:
+        DataSetError: an active ramp that nobody has chosen yet.
     """
-    rng = np.random.default_rng([plan.seed, 2, ramp])
     if plan.loads.sequence == "sobol" and ramp * plan.ramp in data.split_draws("train"):
         point = sobol_point(plan.loads, plan.ramp, ramp, plan.seed)
-        load, sizes = draw_load(data.body, data.shapes, plan.loads, QuasiRandom(point)), point[-plan.ramp :]
-    else:
-        load, sizes = draw_load(data.body, data.shapes, plan.loads, rng), rng.uniform(0.0, 1.0, plan.ramp)
+        load = draw_load(data.body, data.shapes, plan.loads, QuasiRandom(point))
+        return _sized(data, plan, load, point[-plan.ramp :])
+    if ramp * plan.ramp in data.split_draws("active"):
+        place = ramp - data.split_draws("active").start // plan.ramp
+        candidate = int(data.chosen[place])
+        if candidate < 0:
+            raise DataSetError(f"ramp_loads.ramp: nobody has chosen yet what ramp {ramp} of {data.path} is.")
+        return candidate_loads(data, plan, candidate)
+    return _drawn(data, plan, np.random.default_rng([plan.seed, 2, ramp]))
+
+
+def candidate_loads(data: DataSet, plan: Plan, candidate: int) -> tuple[Floats, Floats]:
+    """A load that active draws may be chosen from, as `ramp_loads` says; none is among the other draws.
+
+    Args:
+        data: as `ramp_loads`.
+        plan: as `ramp_loads`.
+        candidate: its number, from 0.
+    """
+    return _drawn(data, plan, np.random.default_rng([plan.seed, 5, candidate]))
+
+
+def _drawn(data: DataSet, plan: Plan, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    load = draw_load(data.body, data.shapes, plan.loads, rng)
+    return _sized(data, plan, load, rng.uniform(0.0, 1.0, plan.ramp))
+
+
+def _sized(data: DataSet, plan: Plan, load: Floats, sizes: Floats) -> tuple[Floats, Floats]:
+    """A load of unit size as large as wanted, and the factors of its ramp."""
     if plan.loads.amplitude is not None:
         return plan.loads.amplitude * load, np.linspace(0.0, 1.0, plan.ramp + 1)[1:]
     top = data.header["amplitude"] / _peak(data.response.apply(load[None, data.response.loaded])[0])
     return top * load, np.sort(sizes)
 
 
-def _solve_ramp(data: DataSet, plan: Plan, problem: Problem, ramp: int) -> Iterator[dict[str, Any]]:
+def _solve_ramp(
+    data: DataSet, plan: Plan, problem: Problem, ramp: int, predictor: Predictor | None
+) -> Iterator[dict[str, Any]]:
     load, factors = ramp_loads(data, plan, ramp)
     loaded = data.response.loaded
     state: Equilibrium | None = None
@@ -433,8 +487,9 @@ def _solve_ramp(data: DataSet, plan: Plan, problem: Problem, ramp: int) -> Itera
         probe = np.random.default_rng([plan.seed, 3, ramp * plan.ramp + i]).standard_normal(len(data.shapes))
         row = data.sizes.failed() | {"forces": factor * load[loaded], "probes": probe}
         guess = None if state is None else _ahead(problem, state.displacement, (factor - factors[i - 1]) * load)
+        start = None if predictor is None or guess is not None else proposal_for(factor * load, predictor)
         try:
-            state = problem.solve(factor * load, guess)
+            state = problem.solve(factor * load, guess, proposal=start)
         except NotConverged:
             state = None
             yield row

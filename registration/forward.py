@@ -121,16 +121,16 @@ class _PickedState:
     """Any state behind a force basis: rows of the whole."""
 
     def __init__(self, model: _PickedModel, coefficients: Floats, full: State) -> None:
-        self._model, self.coefficients, self.full = model, coefficients, full
+        self.model, self.coefficients, self.full = model, coefficients, full
         self._pushed: Floats | None = None
 
     @property
     def positions(self) -> Floats:
-        return self.full.displacement[self._model.nodes]
+        return self.full.displacement[self.model.nodes]
 
     def _basis_pushed(self) -> Floats:
         if self._pushed is None:
-            self._pushed = self.full.push(self._model.basis)[self._model.rows]
+            self._pushed = self.full.push(self.model.basis)[self.model.rows]
         return self._pushed
 
     def jacobian(self, rows: csr_array) -> Floats:
@@ -154,8 +154,8 @@ class _PickedModel:
     def combined(self, matrix: Floats) -> _PickedModel:
         return _PickedModel(self.model, self.nodes, self.basis @ matrix)
 
-    def solve(self, coefficients: Floats, near: _PickedState | None = None) -> _PickedState:
-        if near is not None and np.array_equal(near.coefficients, coefficients):
+    def solve(self, coefficients: Floats, near: ReducedState | None = None) -> _PickedState:
+        if isinstance(near, _PickedState) and near.model is self and np.array_equal(near.coefficients, coefficients):
             return near
         forces = (self.basis @ coefficients).reshape(-1, 3)
         return _PickedState(self, coefficients, self.model.solve(forces, None if near is None else near.full))

@@ -168,6 +168,7 @@ class Registration:
         evaluations: forward solves.
         seconds: wall time.
         trace: one entry an iteration.
+        draft: what a faster model had found, where this one went on from there.
     """
 
     prepared: Prepared
@@ -190,6 +191,7 @@ class Registration:
     evaluations: int
     seconds: float
     trace: tuple[Step, ...]
+    draft: Registration | None = None
 
     @property
     def coefficients(self) -> Floats:
@@ -268,6 +270,26 @@ class Registrar:
             return self._cold(points, begin)
         return result
 
+    def refine(self, cloud: ArrayLike, draft: Registration) -> Registration:
+        """What this model makes of a cloud, from what another model of the same body has found for it.
+
+        Args:
+            cloud: observed points, (p, 3), metres.
+            draft: the other model's result, in which forces are sought where it has found them.
+
+        Raises:
+            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+            NotConverged: the model found no state there.
+        """
+        begin = time.perf_counter()
+        points, solver = self._checked(cloud), self._thorough.following()
+        forces = replace(draft.prepared.forces, scale=self.forces.scale)
+        prepared = Prepared.of(self.model, self.observed, forces)
+        problem = self._plain(points, prepared)
+        start = draft.trial.coefficients[: problem.pose_part.stop].copy()
+        found = solver.solve(problem, start, problem.begun(start, draft.trial))
+        return replace(self._finished(points, prepared, found, begin), draft=draft)
+
     def follow(self, cloud: ArrayLike, last: Registration | None) -> Registration:
         """The next frame of a sequence: from the last one, and from rest where that is not accepted.
 
@@ -288,7 +310,7 @@ class Registrar:
         began_anew = warm.prepared is not last.prepared
         if warm.judgement.verdict is Verdict.ACCEPTED or began_anew:
             return warm
-        return min(warm, self.register(cloud), key=_badness)
+        return min(warm, self.register(cloud), key=badness)
 
     def _plain(self, points: Floats, prepared: Prepared) -> Problem:
         """The problem with the model's error as the least noise."""
@@ -512,7 +534,8 @@ def _thinned(points: Floats, most: int) -> Floats:
     return points if len(points) <= most else points[thinned(points, most)]
 
 
-def _badness(result: Registration) -> tuple[int, float]:
+def badness(result: Registration) -> tuple[int, float]:
+    """By which results for one cloud are ordered, the best first."""
     return list(Verdict).index(result.judgement.verdict), result.noise
 
 

@@ -65,8 +65,9 @@ class SurrogateState:
         spread, domain = self._surrogate.maps.spread, self._surrogate.card.get("domain")
         if spread is None or domain is None:
             return None
-        far = np.sqrt(((self.coordinates / spread) ** 2).mean()) / domain["reach"]
-        moved = np.linalg.norm(self.displacement, axis=1).max() / domain["displacement_m"]
+        scaled = self.coordinates / spread
+        far = np.sqrt(scaled @ scaled / len(scaled)) / domain["reach"]
+        moved = np.sqrt(np.einsum("ni,ni->n", self.displacement, self.displacement).max()) / domain["displacement_m"]
         return float(max(far, moved))
 
     def push(self, changes: ArrayLike) -> Floats:

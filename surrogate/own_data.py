@@ -13,6 +13,7 @@ from scipy.sparse.linalg import splu
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import (
+    NEEDED,
     SPLITS,
     DataSet,
     DataSetError,
@@ -183,10 +184,9 @@ def _splits(splits: Mapping[str, ArrayLike] | None, count: int, seed: int) -> di
     if splits is None:
         order, held = np.random.default_rng(seed).permutation(count), max(1, count // 10)
         splits = {"train": order[2 * held :], "validation": order[:held], "test": order[held : 2 * held]}
-    *always, optional = SPLITS
-    if set(splits) - {optional} != set(always):
+    if set(splits) - {"calibration"} != set(NEEDED):
         raise ValueError(
-            f"data_set_from_arrays.splits: expected {', '.join(always)} (and {optional} for bounds on errors), got "
+            f"data_set_from_arrays.splits: expected {', '.join(NEEDED)} (and calibration for bounds on errors), got "
             f"{', '.join(splits)}."
         )
     chosen: dict[Split, Ints] = {

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from softtwin.reference.data.part import Part
 from softtwin.reference.ranks import on_first
 from softtwin.surrogate.pod import learned_basis
 
-from ..config import Config
+from ..config import Config, ConfigError
 from ..inputs import current_body, generate_inputs, plan_entries
 from ..workspace import Workspace, open_workspace, record_stage
 
@@ -26,7 +28,7 @@ Floats = NDArray[np.float64]
 def generate_stage(
     configuration: Path, redo: Sequence[int] = (), again: bool = False, part: Part | None = None
 ) -> DataSet | None:
-    """Solve the equilibria of the data set, and their Jacobians where these are wanted.
+    """Solve the equilibria of the data set, those of active rounds after the others, and their Jacobians where wanted.
 
     Collective where mpirun started it; returns None on ranks other than 0.
 
@@ -34,10 +36,12 @@ def generate_stage(
         configuration: the configuration file, read on rank 0 alone.
         redo: numbers of blocks to make again.
         again: throw away what is there.
-        part: solve the blocks of one part alone; what is missing in the end, and the Jacobians, the whole stage makes.
+        part: solve the blocks of one part alone; what is missing in the end, active rounds and the Jacobians, the whole
+            stage makes.
 
     Raises:
-        ConfigError: there is no body yet, or one of another configuration.
+        CalibrationError: active rounds are wanted of a material whose residual torch does not know.
+        ConfigError: there is no body yet, or one of another configuration; active rounds are wanted without torch.
         DataSetError: the folder holds a data set of another configuration, or somebody else writes it.
         FailedElsewhere: on the other ranks, where rank 0 raises one of these.
     """
@@ -49,20 +53,45 @@ def generate_stage(
     asked = on_first(comm, lambda: _read(configuration))
     if asked is None:
         generate(None, None, None, comm, part=part)
+        while comm.bcast(None, root=0) is not None:
+            on_first(comm, lambda: None)
+            generate(None, None, None, comm)
         if comm.bcast(None, root=0):
             on_first(comm, lambda: None)
             differentiate(None, None, comm)
         return None
     space, body = asked
     plan = plan_from_header({"plan": plan_entries(space.config)})
-    data = generate(space.data, body, plan, comm, redo, again, part)
+    active = _active_rounds(space.config) if part is None else None
+    task = active.solver(space.config) if active else None
+    data = generate(space.data, body, plan, comm, redo, again, part, task)
     assert data is not None
+    while active and (number := active.next_round(space.config, data)) is not None:
+        comm.bcast(number, root=0)
+        on_first(comm, partial(active.choose, space, data, number))
+        data = generate(space.data, body, plan, comm, task=task)
+        assert data is not None
+    comm.bcast(None, root=0)
     if comm.bcast(part is None and space.config.wants_jacobians, root=0):
         modes = on_first(comm, lambda: jacobian_modes(space.config, data))
         differentiate(space.data, modes, comm)
     if part is None:
         record_stage(space, "generate", time.perf_counter() - begin, generate_inputs(space, body))
     return data
+
+
+def _active_rounds(config: Config) -> Any:
+    """What active rounds are made with; None where none are wanted."""
+    if not config.samples.rounds:
+        return None
+    try:
+        from . import rounds
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"samples.rounds: expected torch for the networks that choose draws, found no {error.name}; install "
+            "softtwin[torch], or set samples.rounds = 0."
+        ) from error
+    return rounds
 
 
 def jacobian_modes(config: Config, data: DataSet) -> Floats:
@@ -87,10 +116,14 @@ def describe_data(data: DataSet) -> str:
     rejected = data.rejected()
     counts = {reason: rejected.reasons.count(reason) for reason in sorted(set(rejected.reasons))}
     total = sum(data.header["samples"].values())
+    chosen = data.header["samples"].get("active", 0)
     because = f" ({', '.join(f'{count} {reason}' for reason, count in counts.items())})" if counts else ""
     modes = stored_modes(data)
+    active = f", {chosen} of them chosen in active rounds" if chosen else ""
     jacobians = "" if modes is None else f", Jacobians of {modes.shape[1]} modes"
-    return f"{total - len(rejected.draws)} equilibria accepted, {len(rejected.draws)} rejected{because}{jacobians}"
+    return (
+        f"{total - len(rejected.draws)} equilibria accepted, {len(rejected.draws)} rejected{because}{active}{jacobians}"
+    )
 
 
 def _read(configuration: Path) -> tuple[Workspace, Body]:

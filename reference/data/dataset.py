@@ -24,8 +24,9 @@ from .schema import Reason
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Split = Literal["train", "validation", "test", "calibration"]
-SPLITS: tuple[Split, ...] = ("train", "validation", "test", "calibration")  # the last may be absent
+Split = Literal["train", "validation", "test", "calibration", "active"]
+NEEDED: tuple[Split, ...] = ("train", "validation", "test")
+SPLITS: tuple[Split, ...] = (*NEEDED, "calibration", "active")  # the active draws are learned from with the training's
 FORMAT = 1
 
 
@@ -205,25 +206,41 @@ class DataSet:
             first += -(-count // self.header["block"]) * self.header["block"]
         raise DataSetError(f"DataSet.split: expected one of {SPLITS}, got {split!r}.")
 
+    def ranges(self, split: Split, limit: int | None = None) -> list[range]:
+        """Numbers of a split's draws as they are read: behind the training draws come those of active rounds.
+
+        Args:
+            split: name of the split.
+            limit: the first so many draws only.
+        """
+        first = self.split_draws(split)[:limit]
+        if split != "train":
+            return [first]
+        return [first, self.split_draws("active")[: None if limit is None else limit - len(first)]]
+
     def samples(self, split: Split, limit: int | None = None) -> Samples:
         """The accepted samples of a split, checked against their checksums.
 
         Args:
-            split: `train`, `validation`, `test` or `calibration`.
+            split: `train` (with the draws of active rounds behind), `validation`, `test`, `calibration` or `active`.
             limit: take the first so many draws only.
 
         Raises:
             DataSetError: blocks are missing or damaged.
         """
-        draws = self.split_draws(split)[:limit]
-        self._check_blocks(draws)
-        group = self._root["samples"]
-        part = slice(draws.start, draws.stop)
-        kept = group["reason"][part] == 0
+        ranges = self.ranges(split, limit)
+        for draws in ranges:
+            self._check_blocks(draws)
+        kept = self._read("reason", ranges) == 0
         return Samples(
-            draws=np.arange(draws.start, draws.stop)[kept],
-            **{name: group[name][part][kept] for name in schema.FIELDS},
+            draws=np.concatenate([np.asarray(draws, dtype=np.int64) for draws in ranges])[kept],
+            **{name: self._read(name, ranges)[kept] for name in schema.FIELDS},
         )
+
+    @property
+    def chosen(self) -> Ints:
+        """Numbers of the candidate ramps that the active draws are, in their order; -1 for those not chosen yet."""
+        return np.asarray(self._root["active/ramps"][:]) if "active" in self._root else np.empty(0, dtype=np.int64)
 
     def rows(self, draws: range) -> dict[str, NDArray[Any]]:
         """Everything that is stored of draws, rejected ones too, by name; not checked (see `check_complete`)."""
@@ -243,7 +260,8 @@ class DataSet:
         Raises:
             DataSetError: it is so.
         """
-        self._check_blocks(self.split_draws(split))
+        for draws in self.ranges(split):
+            self._check_blocks(draws)
 
     def rejected(self) -> Rejected:
         """All draws of all splits that were kept apart."""
@@ -257,9 +275,12 @@ class DataSet:
 
     def figures(self, split: Split) -> dict[str, NDArray[Any]]:
         """What the solver said of each draw of a split: energy, residual, iterations, load steps, pivots, reason."""
-        draws = self.split_draws(split)
-        group = self._root["samples"]
-        return {name: group[name][draws.start : draws.stop] for name in schema.FIGURES}
+        ranges = self.ranges(split)
+        return {name: self._read(name, ranges) for name in schema.FIGURES}
+
+    def _read(self, name: str, ranges: list[range]) -> NDArray[Any]:
+        array = self._root["samples"][name]
+        return np.concatenate([array[draws.start : draws.stop] for draws in ranges])
 
     def _check_blocks(self, draws: range) -> None:
         size = self.header["block"]
@@ -379,6 +400,9 @@ def _create_samples(root: zarr.Group, header: dict[str, Any], sizes: schema.Size
             f"samples/{name}", shape=(blocks * block, *shape), chunks=(block, *shape), dtype=kind, fill_value=0
         )
     root.create_array("samples/checksum", shape=(blocks,), chunks=(1,), dtype="u4", fill_value=0)
+    if header["samples"].get("active"):
+        ramps = header["samples"]["active"] // stored_plan(header).get("ramp", 1)
+        root.create_array("active/ramps", shape=(ramps,), dtype="i8", fill_value=-1)
 
 
 def write_block(path: Path, block: int, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -396,6 +420,26 @@ def write_block(path: Path, block: int, arrays: Mapping[str, NDArray[Any]]) -> N
     for name, values in typed.items():
         group[name][part] = values
     group["checksum"][block] = checksum(typed)
+
+
+def write_chosen(path: Path, first: int, ramps: Ints) -> None:
+    """Say which candidates the next active draws are.
+
+    Args:
+        path: folder of the data set.
+        first: place of the first of them among the active ramps.
+        ramps: numbers of the candidates.
+
+    Raises:
+        DataSetError: some of these places are not there, or taken.
+    """
+    places = slice(first, first + len(ramps))
+    taken = DataSet(path).chosen[places]
+    if len(taken) < len(ramps) or (taken >= 0).any():
+        raise DataSetError(
+            f"write_chosen.first: expected {len(ramps)} free places from {first} in {path}, got {(taken < 0).sum()}."
+        )
+    zarr.open_group(str(path), mode="r+")["active/ramps"][places] = ramps
 
 
 def drop_block(path: Path, block: int) -> None:

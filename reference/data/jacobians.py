@@ -79,7 +79,7 @@ def read_jacobians(data: DataSet, draws: Ints) -> Jacobians | None:
 def missing_jacobians(data: DataSet) -> list[int]:
     """Numbers of the blocks whose Jacobians are still to be made, or again; all where there are none."""
     group = _group(data.path)
-    blocks = range(_block_count(data))
+    blocks = _blocks(data)
     return [block for block in blocks if group is None or _state(data.path, group, block, data.header["block"])]
 
 
@@ -98,18 +98,19 @@ def prepare_jacobians(data: DataSet, modes: Floats) -> list[int]:
         data: the data set.
         modes: V, (3n, r).
     """
-    size, blocks = data.header["block"], _block_count(data)
+    size, blocks = data.header["block"], _blocks(data)
     group = _group(data.path)
     if group is None or not _are(data, modes):
         root = zarr.open_group(str(data.path), mode="r+")
         group, rank = root.create_group(_GROUP, overwrite=True), modes.shape[1]
         group.create_array("modes", data=np.ascontiguousarray(modes))
-        shape, chunks = (blocks * size, rank, rank), (size, rank, rank)
+        places = blocks[-1] + 1  # those of blocks that are not learned from stay empty
+        shape, chunks = (places * size, rank, rank), (size, rank, rank)
         group.create_array("values", shape=shape, chunks=chunks, dtype="f4", fill_value=0)
         group.create_array("squares", shape=shape[:1], chunks=chunks[:1], dtype="f8", fill_value=0)
-        group.create_array("checksum", shape=(blocks,), chunks=(1,), dtype="u4", fill_value=0)
+        group.create_array("checksum", shape=(places,), chunks=(1,), dtype="u4", fill_value=0)
         group.attrs["checksum"] = zlib.crc32(np.ascontiguousarray(modes).tobytes())  # comes last: without it none
-    return [block for block in range(blocks) if _state(data.path, group, block, size)]
+    return [block for block in blocks if _state(data.path, group, block, size)]
 
 
 def write_jacobians(path: Path, block: int, values: Floats, squares: Floats) -> None:
@@ -131,9 +132,10 @@ def write_jacobians(path: Path, block: int, values: Floats, squares: Floats) -> 
 _AGAIN = "run `softtwin generate` again with samples.jacobians = true, it makes what is missing."
 
 
-def _block_count(data: DataSet) -> int:
-    draws = data.split_draws("train")  # the first of the splits: its blocks are the first ones
-    return -(-len(draws) // data.header["block"])
+def _blocks(data: DataSet) -> list[int]:
+    """Numbers of the blocks that are learned from."""
+    size = data.header["block"]
+    return [block for draws in data.ranges("train") for block in range(draws.start // size, -(-draws.stop // size))]
 
 
 def _group(path: Path) -> Any:

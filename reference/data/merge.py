@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .dataset import SPLITS, DataSet, DataSetError, Split, create, stored_plan, write_block
+from .dataset import NEEDED, SPLITS, DataSet, DataSetError, Split, create, stored_plan, write_block
 
 _SAME = ("material", "young_modulus", "poisson_ratio")
 
@@ -20,8 +20,8 @@ _SAME = ("material", "young_modulus", "poisson_ratio")
 def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
     """A data set with all draws of others, split by split: what was held out stays held out.
 
-    Its plan is the first one's, with the samples of all; it cannot be gone on with. Jacobians are not taken along:
-    `generate` makes them again.
+    Draws of active rounds become training draws. Its plan is the first one's, with the samples of all; it cannot be
+    gone on with. Jacobians are not taken along: `generate` makes them again.
 
     Args:
         sources: at least two, complete, of one body, one material and the same modes.
@@ -35,7 +35,8 @@ def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
     _check(sources, path)
     first = sources[0]
     block = first.header["block"]
-    counts = {split: sum(len(source.split_draws(split)) for source in sources) for split in SPLITS}
+    kinds: tuple[Split, ...] = (*NEEDED, "calibration")
+    counts = {split: sum(map(len, _ranges(sources, split))) for split in kinds}
     counts = {split: count for split, count in counts.items() if count}
     header = {
         **{name: entry for name, entry in first.header.items() if name not in ("format", "body", "checksums")},
@@ -108,11 +109,15 @@ def _refuse_twice(sources: Sequence[DataSet]) -> None:
         )
 
 
+def _ranges(sources: Sequence[DataSet], split: Split) -> list[range]:
+    return [draws for source in sources for draws in source.ranges(split)]
+
+
 def _blocks(sources: Sequence[DataSet], split: Split, size: int) -> Iterator[dict[str, NDArray[Any]]]:
     """The rows of a split of all sources one after the other, in whole blocks; the last is filled up with its last."""
     kept: dict[str, NDArray[Any]] = {}
-    for source in sources:
-        draws = source.split_draws(split)
+    pairs = [(source, draws) for source in sources for draws in source.ranges(split)]
+    for source, draws in pairs:
         for begin in range(draws.start, draws.stop, size):
             rows = source.rows(range(begin, min(begin + size, draws.stop)))
             kept = {name: np.concatenate([kept[name], values]) if kept else values for name, values in rows.items()}

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.meshes.body import Body
 
 from ..data.loading import Loading, checked_array
-from ..data.materials import MATERIALS, Material
+from ..data.materials import Material
 from ..data.outcome import Equilibrium
+from ..solve.predictor import Adviser, Predictor, check_predictor
 from ..solve.problem import Problem
 
 Floats = NDArray[np.float64]
@@ -28,30 +28,11 @@ class Start(Protocol):
         """Of the nodes, (n, 3), metres."""
 
 
-class Predictor(Protocol):
-    """What says where an equilibrium is likely to be, as far as a search starts there: a surrogate."""
-
-    @property
-    def body(self) -> Body:
-        """The body that it knows."""
-
-    @property
-    def learned_material(self) -> Mapping[str, Any] | None:
-        """`material`, `young_modulus`, `poisson_ratio` that it has learned; None where that is not known."""
-
-    def propose(self, forces: ArrayLike, linear: Floats | None = None) -> Floats:
-        """The displacement, (n, 3), metres, that is thought to balance nodal forces, (n, 3), newtons.
-
-        Args:
-            forces: nodal forces.
-            linear: the linear response to them, (n, 3), metres, where that is known.
-        """
-
-
 class ReferenceModel:
     """Forces to equilibrium by finite elements, from where a network says if there is one (hybrid Newton).
 
-    It remembers no state: what a solve found is the value that it returns.
+    It remembers no state: what a solve found is the value that it returns. Of a predictor it remembers how long it has
+    been of no use, and asks it the more seldom.
 
     Args:
         problem: body, material and options; stays owned by the caller.
@@ -75,9 +56,9 @@ class ReferenceModel:
         predictor: Predictor | None = None,
     ) -> None:
         self.problem, self.patient, self.loading = problem, patient, loading or Loading()
-        self.predictor = predictor
         if predictor is not None:
-            _check_predictor(predictor, problem)
+            check_predictor(predictor, problem)
+        self._adviser = None if predictor is None else Adviser(predictor)
 
     @property
     def body(self) -> Body:
@@ -113,41 +94,15 @@ class ReferenceModel:
         proposal: Any = None
         if near is not None and guess is None:
             proposal = near.displacement
-        elif near is None and self.predictor is not None:
-            proposal = partial(self._proposed, self.predictor, given)
+        adviser = self._adviser if near is None else None
+        if adviser is not None:
+            proposal = adviser.proposal(given)
         found = self.problem.solve(
             load, guess, proposal=proposal, stability=False, fallback=self.patient or guess is None
         )
+        if adviser is not None and proposal is not None:
+            adviser.learn(found.start == "proposal")
         return ReferenceState(given, found, self, self.problem.material)
-
-    @staticmethod
-    def _proposed(predictor: Predictor, forces: Floats, linear: Floats) -> Floats | None:
-        """What a predictor says, if anything that one could start from."""
-        try:
-            proposal = predictor.propose(forces, linear)
-        except ValueError:  # forces where it has never seen any
-            return None
-        return proposal if np.isfinite(proposal).all() else None
-
-
-def _check_predictor(predictor: Predictor, problem: Problem) -> None:
-    if predictor.body.fingerprint != problem.body.fingerprint:
-        raise ValueError(
-            f"ReferenceModel.predictor: expected a network of this body (fingerprint "
-            f"{problem.body.fingerprint[:12]}...), got one of another ({predictor.body.fingerprint[:12]}...)."
-        )
-    learned = predictor.learned_material
-    if learned is None:
-        return
-    expected = MATERIALS.get(learned["material"])
-    theirs = {name: learned[name] for name in ("young_modulus", "poisson_ratio")}
-    here = problem.material
-    same = isinstance(here, expected) if expected is not None else False
-    if not same or any(np.any(getattr(here, name, None) != value) for name, value in theirs.items()):
-        raise ValueError(
-            f"ReferenceModel.predictor: expected a network of {here!r}, got one that has learned "
-            f"{learned['material']} with {theirs}; its proposals would lie elsewhere."
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,6 +96,47 @@ def test_random_weights_change_no_state_and_no_iteration(problem: Problem, netwo
         assert found.equilibrium.start == "linear response"
 
 
+class Counted:
+    """A network, and how often it was asked."""
+
+    def __init__(self, network: Surrogate) -> None:
+        self.network, self.asked = network, 0
+        self.body, self.learned_material = network.body, network.learned_material
+
+    def propose(self, forces: np.ndarray, linear: np.ndarray | None = None) -> np.ndarray:
+        self.asked += 1
+        return self.network.propose(forces, linear)
+
+
+def test_a_network_that_is_never_right_is_asked_ever_more_seldom(
+    problem: Problem, network: Surrogate, data: DataSet
+) -> None:
+    hybrid = ReferenceModel(problem, predictor=network)
+    load = next(load for load in held_out(data) if hybrid.solve(load).equilibrium.start == "proposal")
+    random = Counted(with_random_weights(network))
+    model = ReferenceModel(problem, predictor=random)
+    for _ in range(8):
+        model.solve(load)
+    assert random.asked == 8
+    for _ in range(1 + 1 + 2 + 1 + 4 + 1):  # pauses of one, two and four solves
+        model.solve(load)
+    assert random.asked == 11
+    random.network = network  # it has learned something meanwhile
+    for _ in range(8 + 1):
+        found = model.solve(load)
+    assert random.asked == 12 and found.equilibrium.start == "proposal"
+    model.solve(load)
+    assert random.asked == 13
+
+
+def test_a_network_that_is_right_is_always_asked(problem: Problem, network: Surrogate, data: DataSet) -> None:
+    counted, loads = Counted(network), list(held_out(data))
+    model = ReferenceModel(problem, predictor=counted)
+    for load in loads:
+        model.solve(load)
+    assert counted.asked == len(loads)
+
+
 @pytest.mark.parametrize("kind", ["inside out", "not finite"])
 def test_nonsense_from_a_network_is_left_aside(problem: Problem, data: DataSet, kind: str) -> None:
     load = next(held_out(data))
@@ -147,7 +188,7 @@ def test_a_proposal_takes_the_linear_response_that_is_known(
 
 def test_a_network_of_another_body_is_refused(network: Surrogate) -> None:
     other = beam((4, 2, 2), (0.6, 0.2, 0.2), "hexahedron")
-    refused = pytest.raises(ValueError, match=r"ReferenceModel\.predictor: expected a network of this body")
+    refused = pytest.raises(ValueError, match="predictor: expected a network of this body")
     with Problem(other, PLAN.build_material()) as problem, refused:
         ReferenceModel(problem, predictor=network)
 

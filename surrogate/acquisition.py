@@ -1,0 +1,71 @@
+"""Which loads to solve next: where a network is least in balance, and far from each other (active learning)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .model import Surrogate
+from .signs import SignReader
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+_SHORT_LIST = 4  # times as many loads as are wanted, those least in balance, are spread out
+_LEAST_SPREAD = 1e-3  # of the largest: a direction hardly ever loaded must not tell loads apart
+
+
+def most_telling(surrogate: Surrogate, candidates: Iterable[Floats], wanted: int, known: Floats) -> Ints:
+    """Places of the candidates that tell a network most.
+
+    Of the loads whose predictions have the longest linear step to balance (`Signs.step`; one that is inside out counts
+    as infinitely far) those are taken that lie far from what is known and from each other in the network's
+    coordinates (farthest-point sampling, Gonzalez 1985).
+
+    Args:
+        surrogate: trained on what is known; its card names the material.
+        candidates: loads at growing sizes, nodal forces (r, n, 3) each, newtons; the worst size counts.
+        wanted: how many to take.
+        known: forces at the loaded nodes that were learned, (s, l, 3), newtons.
+
+    Returns:
+        Places among the candidates, (wanted,), the most telling first.
+
+    Raises:
+        CalibrationError: the card does not name a material that torch knows.
+        ValueError: fewer candidates than are wanted.
+    """
+    reader = SignReader(surrogate)
+    steps, coordinates = [], []
+    for ramp in candidates:
+        found = [reader.read(forces, surrogate.solve(forces)).step for forces in ramp]
+        worst = int(np.argmax(found))
+        steps.append(found[worst])
+        coordinates.append(surrogate.maps.encoded(ramp[worst].ravel()[surrogate.rows]))
+    if len(steps) < wanted:
+        raise ValueError(f"most_telling.candidates: expected at least {wanted}, got {len(steps)}.")
+    short = np.argsort(-np.asarray(steps), kind="stable")[: _SHORT_LIST * wanted]
+    learned = surrogate.maps.encoded(known.reshape(len(known), -1).T).T
+    spread = np.sqrt((learned**2).mean(axis=0))
+    spread = np.maximum(spread, _LEAST_SPREAD * spread.max())
+    places = spread_out(np.stack(coordinates)[short] / spread, wanted, learned / spread)
+    return np.asarray(short[places])
+
+
+def spread_out(points: Floats, wanted: int, taken: Floats) -> Ints:
+    """Places of points that each lie farthest from all that were taken before them, (wanted,).
+
+    Args:
+        points: (m, d).
+        wanted: how many to take.
+        taken: (s, d), those to keep away from to begin with.
+    """
+    gaps = np.array([np.square(taken - point).sum(axis=1).min() for point in points])
+    found = []
+    for _ in range(wanted):
+        place = int(np.argmax(gaps))
+        found.append(place)
+        gaps = np.minimum(gaps, np.square(points - points[place]).sum(axis=1))
+        gaps[found] = -1.0
+    return np.array(found)

@@ -1,0 +1,137 @@
+"""Two models behind one registration: the exact one's answer, from where the fast one has been, whatever that was."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.clouds import CloudError
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.registration.evidence import Scale
+from softtwin.registration.hybrid import HybridRegistrar
+from softtwin.registration.pose import Pose
+from softtwin.registration.registrar import Registrar, RegistrationOptions, register_sequence
+from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.unknowns import PosePrior, nodal_forces
+from softtwin.registration.verdict import Verdict
+
+from .conftest import Cantilever, CantileverState, cloud_on, tip_forces
+
+NET = (0.0, 0.3, -0.8)
+
+
+class Bent(Cantilever):
+    """A fast model that moves too far, and the number of states that it was asked for."""
+
+    def __init__(self, body: Body, too_far: float = 1.0, refuse_above: float = np.inf) -> None:
+        super().__init__(body, refuse_above)
+        self.too_far, self.asked = too_far, 0
+
+    def solve(self, forces: ArrayLike, near: Any = None) -> CantileverState:
+        self.asked += 1
+        found = super().solve(forces)
+        return CantileverState(found.shape, found.mean, self.too_far * found.reach)
+
+
+def engine(fast: Bent, exact: Bent, pose: PosePrior | None = None) -> HybridRegistrar:
+    def alone(model: Bent, options: RegistrationOptions) -> Registrar:
+        body = model.body
+        forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 2.0, least=1e-4))
+        return Registrar(model, SurfaceDistance(body, body.surfaces["observed"]), forces, options, pose=pose)
+
+    thorough = RegistrationOptions(thorough=0.1)  # to a fiftieth of a deviation
+    return HybridRegistrar(alone(fast, RegistrationOptions()), alone(exact, thorough))
+
+
+@pytest.fixture
+def truth(body: Body) -> np.ndarray:
+    return Cantilever(body).solve(tip_forces(body, NET)).displacement
+
+
+@pytest.mark.parametrize("too_far", [1.0, 1.2, 0.7])
+def test_it_ends_where_the_exact_model_ends_alone(body: Body, truth: np.ndarray, rng, too_far: float) -> None:
+    cloud = cloud_on(body, truth, 300, rng, 5e-4)
+    fast, exact = Bent(body, too_far), Bent(body)
+    both = engine(fast, exact)
+    found = both.register(cloud)
+    spent = exact.asked
+    alone = both.exact.register(cloud)
+    assert found.judgement.verdict is alone.judgement.verdict is Verdict.ACCEPTED
+    deviation = np.sqrt(np.diag(alone.net_force_covariance)[1:])
+    assert (np.abs(found.net_force - alone.net_force)[1:] < 0.1 * deviation).all()
+    assert found.draft is not None and found.draft.state.reach == pytest.approx(0.2 * too_far)
+    assert found.state.reach == pytest.approx(0.2)
+    if too_far == 1.0:
+        assert spent < exact.asked - spent  # it has saved the way
+
+
+def test_each_frame_starts_from_the_draft_of_the_one_before(body: Body, rng) -> None:
+    model = Cantilever(body)
+    truths = [model.solve(tip_forces(body, tuple(part * np.array(NET)))).displacement for part in (0.8, 0.9, 1.0)]
+    clouds = [cloud_on(body, truth, 300, rng, 5e-4) for truth in truths]
+    fast, exact = Bent(body, 1.1), Bent(body)
+    both = engine(fast, exact)
+    found = list(register_sequence(both, clouds))
+    for result, truth in zip(found, truths, strict=True):
+        assert result.judgement.verdict is Verdict.ACCEPTED and result.draft is not None
+        assert np.abs(result.displacement - truth)[:, 1:].max() < 1e-3
+    counts = [fast.asked]
+    for last in (None, found[1]):
+        both.follow(clouds[2], last)
+        counts.append(fast.asked)
+    cold, warm = np.diff(counts)
+    assert warm < cold
+
+
+def test_a_pose_is_found_by_both(body: Body, truth: np.ndarray, rng) -> None:
+    centre = body.points.mean(axis=0)
+    turned = Pose.identity().moved(np.array([0.0, 0.02, 0.03, 2e-3, -1e-3, 1e-3]), centre)
+    prior = PosePrior(Pose.identity(), centre, np.deg2rad(5.0), 0.01)
+    cloud = turned.apply(cloud_on(body, truth, 400, rng, 2e-4))
+    both = engine(Bent(body, 1.05), Bent(body), prior)
+    found, alone = both.register(cloud), both.exact.register(cloud)
+    apart = found.pose.apply(body.points) - alone.pose.apply(body.points)
+    assert found.judgement.is_usable and np.abs(apart).max() < 2e-3
+
+
+def test_a_state_that_the_exact_model_has_not_is_looked_for_from_rest(body: Body, truth: np.ndarray, rng) -> None:
+    class Shy(Bent):
+        """Refuses its first states, as a solver far from its start."""
+
+        def solve(self, forces: ArrayLike, near: Any = None) -> CantileverState:
+            if self.asked == 0:
+                self.asked += 1
+                raise NotConverged("too far")
+            return super().solve(forces, near)
+
+    both = engine(Bent(body, 1.3), Shy(body))
+    found = both.register(cloud_on(body, truth, 300, rng, 5e-4))
+    assert found.judgement.verdict is Verdict.ACCEPTED and found.draft is not None
+    assert np.abs(found.displacement - truth)[:, 1:].max() < 1e-3
+
+
+def test_nonsense_of_the_fast_model_is_left_aside(body: Body, truth: np.ndarray, rng) -> None:
+    class Nonsense(Bent):
+        """Moves the wrong way, whatever pulls."""
+
+        def solve(self, forces: ArrayLike, near: Any = None) -> CantileverState:
+            found = super().solve(forces, near)
+            return CantileverState(found.shape, np.abs(found.mean), found.reach)
+
+    both = engine(Nonsense(body), Bent(body))
+    found = both.register(cloud_on(body, truth, 300, rng, 5e-4))
+    assert found.judgement.verdict is Verdict.ACCEPTED
+    assert np.abs(found.displacement - truth)[:, 1:].max() < 1e-3
+
+
+def test_a_cloud_of_something_else_is_refused_by_both(body: Body, rng) -> None:
+    both = engine(Bent(body), Bent(body))
+    other = body.points.mean(axis=0) + rng.uniform(-0.15, 0.15, (300, 3))
+    found = both.register(other)
+    assert found.judgement.verdict is Verdict.REFUSED
+    with pytest.raises(CloudError):
+        both.register(np.full((10, 3), np.nan))
