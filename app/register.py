@@ -29,6 +29,7 @@ from .twin import Camera, Frame, Twin, coordinates_of
 
 Floats = NDArray[np.float64]
 _CLOUDS = (".npy", ".txt", ".csv", ".xyz", ".ply", ".stl", ".obj", ".vtk", ".vtp", ".vtu", ".pcd")
+_FAR_OFF = 0.25  # body sizes that fixed nodes of a truth may be off on average
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,15 @@ def read_truth(path: Path, frames: int, body: Body, coordinates: Coordinates) ->
         )
     if not np.isfinite(positions).all():
         raise ConfigError(f"--truth: expected finite positions, got NaN or infinity in {path}.")
-    return coordinates.directions(positions)
+    turned = coordinates.directions(positions)
+    off = np.linalg.norm(turned[0, body.fixed] - body.points[body.fixed], axis=1)
+    away = float(off.mean()) if len(off) else 0.0
+    if away > _FAR_OFF * body.size:
+        raise ConfigError(
+            f"--truth: expected positions in metres in which the fixed nodes are where the body has them, got them "
+            f"{away:.3g} m away on average in {path}; are these displacements, or in another unit or frame?"
+        )
+    return turned
 
 
 def camera_from_matrix(path: Path, coordinates: Coordinates) -> Pose:

@@ -21,6 +21,7 @@ from softtwin.app.register import (
     register_clouds,
 )
 from softtwin.app.twin import Twin
+from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import FileError, read_body
@@ -112,6 +113,14 @@ def test_a_truth_that_is_not_finite_or_no_array_is_refused(tmp_path: Path, plain
     (tmp_path / "t.npy").write_text("176")
     with pytest.raises(ConfigError, match="array"):
         read_truth(tmp_path / "t.npy", 1, plain_twin.body, METRES)
+
+
+def test_displacements_are_no_truth(tmp_path: Path, plain_twin: Twin) -> None:
+    away = plain_twin.body.points + np.array([0.0, 0.0, 1.0])  # where a scanner has it
+    body = Body(away, plain_twin.body.cells, plain_twin.body.node_sets)
+    np.save(tmp_path / "t.npy", 0.01 * np.ones((1, 176, 3)))
+    with pytest.raises(ConfigError, match=r"--truth: expected positions .* are these displacements"):
+        read_truth(tmp_path / "t.npy", 1, body, METRES)
 
 
 def test_a_matrix_is_in_the_clouds_unit_and_on_their_axes(tmp_path: Path, rng) -> None:
