@@ -69,7 +69,10 @@ class Exporter:
         moved = place.lengths(result.displacement)
         if "vtu" in self.formats:
             names.append(f"{VOLUME}_{number:04d}.vtu")
-            fields = {"force_N": place.directions(result.forces)}
+            fields = {
+                "force_N": place.directions(result.forces),
+                "deviation": place.distances(result.uncertainty.deviation),
+            }
             write_deformed(self.folder / names[-1], self._body, moved, fields)
         kinds = [kind for kind in SURFACE_FORMATS if kind in self.formats]
         for name, surface in self.twin.surfaces(result).items() if kinds else ():

@@ -145,7 +145,12 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
             "reasons": list(bound.reasons),
         }
     moved = {name: points.displace(result.displacement) for name, points in twin.embeddings.items()}
-    row["targets"] = {name: {"movement_m": _mean_length(vectors)} for name, vectors in moved.items()}
+    known = result.uncertainty
+    row["deviation_m"] = {"mean": float(known.deviation.mean()), "largest": float(known.deviation.max())}
+    row["targets"] = {
+        name: {"movement_m": _mean_length(vectors), "margin95_m": float(known.margin(twin.embeddings[name]).max())}
+        for name, vectors in moved.items()
+    }
     if truth is not None:
         rest = twin.body.points
         row["error"] = asdict(target_errors(rest + result.displacement, truth))
@@ -185,7 +190,7 @@ def describe(row: Mapping[str, Any]) -> str:
     if "error" in row:
         line += f", error {millimetres(row['error']['mean'])}"
     for name, target in row["targets"].items():
-        line += f", {name} moved {millimetres(target['movement_m'], 1)}"
+        line += f", {name} moved {millimetres(target['movement_m'], 1)} ± {millimetres(target['margin95_m'], 1)}"
         line += f" ({millimetres(target['error_m'])} off)" if "error_m" in target else ""
     return line
 

@@ -46,6 +46,10 @@ class Coordinates:
         """Points or displacements in these coordinates, (..., 3), from metres and LPS."""
         return PER_METRE[self.unit] * self.directions(vectors)
 
+    def distances(self, metres: ArrayLike) -> Floats:
+        """Lengths that have no direction, in these units, from metres."""
+        return np.asarray(PER_METRE[self.unit] * np.asarray(metres, dtype=np.float64))
+
     def directions(self, vectors: ArrayLike) -> Floats:
         """Vectors of another unit (forces) on these axes, (..., 3)."""
         return _TURN[self.axes] * np.asarray(vectors, dtype=np.float64)

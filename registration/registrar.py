@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,11 @@ from .lbfgs import LBFGS
 from .loss import robust_deviation
 from .outcome import Outcome
 from .pose import Pose
+from .posterior import Posterior
 from .problem import Problem, Trial
 from .residuals import SurfaceDistance
 from .thinning import thinned
+from .uncertainty import Uncertainty, uncertainty, unseen_response
 from .unknowns import Forces, Informed, ModelError, PosePrior, contact, nodal_forces, told, windowed
 from .verdict import Expectations, Judgement, Verdict, judge
 
@@ -137,6 +140,11 @@ class Prepared:
         """The first directions alone."""
         return Prepared(self.forces.leading(count), self.model.combined(np.eye(self.forces.size)[:, :count]))
 
+    @cached_property
+    def unseen(self) -> Floats:
+        """Displacements by the directions of force that were left out, for unit scale, (3n, r)."""
+        return unseen_response(self.model, self.forces)
+
     def believing(self, spread: float) -> Prepared:
         """The same with another spread of the logarithm of the forces' size."""
         scale = replace(self.forces.scale, spread=spread)
@@ -168,6 +176,8 @@ class Registration:
         evaluations: forward solves.
         seconds: wall time.
         trace: one entry an iteration.
+        problem: what was solved, for the cloud and the model's error as they were taken in the end.
+        posterior: of the coefficients.
         draft: what a faster model had found, where this one went on from there.
     """
 
@@ -191,6 +201,8 @@ class Registration:
     evaluations: int
     seconds: float
     trace: tuple[Step, ...]
+    problem: Problem
+    posterior: Posterior
     draft: Registration | None = None
 
     @property
@@ -207,6 +219,15 @@ class Registration:
     def net_force_deviation(self) -> Floats:
         """Standard deviation of each component of the net force, (3,), newtons."""
         return np.sqrt(np.diag(self.net_force_covariance))
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """How far each point of the body may be from where it was found; computed when it is first asked for.
+
+        It holds for what the problem reckons with: noise, forces like those expected, the model's error where its
+        patterns are known. Wrong stiffness, attachment or shape of the body are not among them.
+        """
+        return uncertainty(self.problem, self.trial, self.posterior, self.prepared.unseen)
 
 
 class Registrar:
@@ -464,6 +485,8 @@ class Registrar:
             evaluations=found.evaluations,
             seconds=time.perf_counter() - begin,
             trace=found.trace,
+            problem=problem,
+            posterior=found.posterior,
         )
 
 

@@ -36,6 +36,7 @@ class Forces:
         scale: what is believed of the coefficients' standard deviation, newtons.
         left_out: covariance of the net force of directions that were left out, for unit scale, (3, 3).
         every: the patterns before any direction was left out, (3a, m); None where none was.
+        kept: orthonormal combinations of these that are left, (m, k); None as above.
     """
 
     nodes: Ints
@@ -44,6 +45,7 @@ class Forces:
     scale: Scale = FORCE
     left_out: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     every: Floats | None = None
+    kept: Floats | None = None
 
     @property
     def size(self) -> int:
@@ -53,9 +55,20 @@ class Forces:
     @cached_property
     def basis(self) -> Floats:
         """Forces at all nodes of the body for each coefficient, (3n, k)."""
-        whole = np.zeros((self.count, 3, self.size))
-        whole[self.nodes] = self.patterns.reshape(-1, 3, self.size)
-        return whole.reshape(-1, self.size)
+        return self._at_all(self.patterns)
+
+    def _at_all(self, patterns: Floats) -> Floats:
+        count = patterns.shape[1]
+        whole = np.zeros((self.count, 3, count))
+        whole[self.nodes] = patterns.reshape(-1, 3, count)
+        return whole.reshape(-1, count)
+
+    @property
+    def unseen(self) -> Floats | None:
+        """Forces at all nodes of the directions that were left out, (3n, m), dimensionless; None where none was."""
+        if self.every is None or self.kept is None:
+            return None
+        return self._at_all(self.every - (self.every @ self.kept) @ self.kept.T)
 
     def forces(self, coefficients: Floats) -> Floats:
         """Nodal forces, (n, 3), newtons."""
@@ -71,11 +84,14 @@ class Forces:
         """
         rest = self.net_basis - (self.net_basis @ kept) @ kept.T
         every = self.patterns if self.every is None else self.every
-        return replace(self, patterns=self.patterns @ kept, left_out=self.left_out + rest @ rest.T, every=every)
+        left = self.left_out + rest @ rest.T
+        both = kept if self.kept is None else self.kept @ kept
+        return replace(self, patterns=self.patterns @ kept, left_out=left, every=every, kept=both)
 
     def leading(self, count: int) -> Forces:
         """The first directions alone: those that move the observed side most, where they were reduced."""
-        return replace(self, patterns=self.patterns[:, :count])
+        kept = None if self.kept is None else self.kept[:, :count]
+        return replace(self, patterns=self.patterns[:, :count], kept=kept)
 
     @cached_property
     def net_basis(self) -> Floats:
@@ -174,7 +190,7 @@ def windowed(forces: Forces, where: Floats) -> Forces:
     patterns = parts[:, None] * forces.patterns
     every = forces.patterns if forces.every is None else forces.every
     whole, kept = _parted_net(parts, every), _net(patterns)
-    return replace(forces, patterns=patterns, left_out=whole @ whole.T - kept @ kept.T, every=None)
+    return replace(forces, patterns=patterns, left_out=whole @ whole.T - kept @ kept.T, every=None, kept=None)
 
 
 def _parted_net(parts: Floats, patterns: Floats) -> Floats:

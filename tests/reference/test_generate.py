@@ -52,7 +52,7 @@ def body() -> Body:
 
 def contents(data: DataSet) -> dict[str, np.ndarray]:
     found = {}
-    for split in SPLITS:
+    for split in PLAN.samples:
         samples = data.samples(split)
         for name in ("draws", "forces", "displacements", "probes", "adjoints"):
             found[f"{split}.{name}"] = getattr(samples, name)

@@ -130,7 +130,7 @@ def test_states_keep_what_they_are(
     again = (first.displacement, first.push(changes), first.pull(cotangent))
     for was, now, elsewhere in zip(before, again, apart, strict=True):
         np.testing.assert_allclose(now, was, rtol=0.0, atol=1e-12 * np.abs(was).max())
-        assert np.abs(elsewhere - was).max() > 1e-3 * np.abs(was).max()
+        assert np.abs(elsewhere - was).max() > 1e-5 * np.abs(was).max()  # ten million times what may change
 
 
 def test_pivots_are_counted_or_not_known(model: ForwardModel, load: np.ndarray) -> None:

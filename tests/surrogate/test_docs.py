@@ -39,9 +39,10 @@ def test_the_guide_runs(data: DataSet, closed_form: Any, tmp_path: Path, capsys,
     assert len(names["mine"].samples("train")) == 24
 
 
-def test_the_configuration_is_one() -> None:
-    (block,) = re.findall(r"```toml\n(.*?)```", TEXT, flags=re.S)
-    assert parse_config(tomllib.loads(block)).training.physics == {"energy": 0.1}
+def test_the_configurations_are_such() -> None:
+    training, rounds = (parse_config(tomllib.loads(b)) for b in re.findall(r"```toml\n(.*?)```", TEXT, flags=re.S))
+    assert training.training.physics == {"energy": 0.1}
+    assert (rounds.samples.rounds, rounds.samples.chosen, rounds.samples.candidates) == (6, 256, 16)
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)

@@ -1,0 +1,125 @@
+"""How far each point may be from where it was found: what is known of the unknowns, carried through the derivatives.
+
+The posterior of forces, pose and model error is normal (Laplace) and of low rank; so is that of the displacement (the
+design is hIPPYlib's GaussianLRPosterior: Villa, Petra and Ghattas, ACM Trans. Math. Softw. 47 (2021)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from softtwin.meshes.embedding import Embedding
+
+from .forward import ReducedModel
+from .posterior import Posterior
+from .problem import Problem, Trial
+from .unknowns import Forces
+
+Floats = NDArray[np.float64]
+_DRAWN = 64  # combinations that stand for all directions that were left out
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """A normal law of the displacement, with that of the pose where this is unknown, about what was found.
+
+    The covariance is F F^T, and the square of a deviation of its own for each component of each node.
+
+    Args:
+        factor: F, (3n, r), metres.
+        rest: of one component of each node, (n,), metres.
+    """
+
+    factor: Floats
+    rest: Floats
+
+    def covariances(self, points: Embedding | None = None) -> Floats:
+        """Of the displacement of each point, (p, 3, 3), metres^2, on the body's axes.
+
+        Args:
+            points: carried by the body; the nodes if not given.
+        """
+        count = self.factor.shape[1]
+        if points is None:
+            factor, rest = self.factor.reshape(-1, 3, count), self.rest
+        else:
+            factor = (points.matrix @ self.factor.reshape(-1, 3 * count)).reshape(-1, 3, count)
+            rest = points.matrix @ self.rest
+        return factor @ factor.transpose(0, 2, 1) + np.square(rest)[:, None, None] * np.eye(3)
+
+    @cached_property
+    def deviation(self) -> Floats:
+        """Root mean square length of each node's error, (n,), metres."""
+        return np.sqrt(np.trace(self.covariances(), axis1=1, axis2=2))
+
+    def margin(self, points: Embedding | None = None, confidence: float = 0.95) -> Floats:
+        """Distance within which each point is of where it was found, with so much confidence, (p,), metres.
+
+        The squared length of a normal error is taken as a multiple of chi-square with its mean and variance
+        (Satterthwaite 1946).
+
+        Args:
+            points: carried by the body; the nodes if not given.
+            confidence: in (0, 1).
+
+        Raises:
+            ValueError: another confidence.
+        """
+        if not 0.0 < confidence < 1.0:
+            raise ValueError(f"Uncertainty.margin.confidence: expected a number in (0, 1), got {confidence}.")
+        every = self.covariances(points)
+        mean = np.trace(every, axis1=1, axis2=2)
+        squares = np.einsum("pij,pij->p", every, every)
+        known = squares > 0.0
+        freedom = np.divide(mean**2, squares, out=np.ones_like(mean), where=known)
+        factor = np.divide(squares, mean, out=np.zeros_like(mean), where=known)
+        return np.sqrt(factor * chi2.ppf(confidence, freedom))
+
+
+def unseen_response(model: ReducedModel, forces: Forces) -> Floats:
+    """Displacements at rest by the directions left out, for unit scale, (3n, r): a factor of their covariance.
+
+    Where they are many, random combinations stand for them: a variance is known to a fifth.
+
+    Args:
+        model: between the coefficients and the observed nodes.
+        forces: the forces.
+    """
+    directions = forces.unseen
+    if directions is None:
+        return np.zeros((3 * forces.count, 0))
+    if directions.shape[1] > _DRAWN:
+        chance = np.random.default_rng(0).standard_normal((directions.shape[1], _DRAWN))
+        directions = directions @ (chance / np.sqrt(_DRAWN))
+    return np.asarray(model.solve(np.zeros(model.count)).full.push(directions))
+
+
+def uncertainty(problem: Problem, trial: Trial, posterior: Posterior, unseen: Floats) -> Uncertainty:
+    """What is known of the displacement where a solver ended.
+
+    Args:
+        problem: what was registered.
+        trial: where.
+        posterior: there.
+        unseen: response to the directions of force that were left out, as from `unseen_response`.
+    """
+    state = trial.state.full
+    blocks = [state.push(problem.forces.basis)]
+    if problem.pose is not None and trial.pose is not None:
+        twist = problem.pose.deviations * trial.coefficients[problem.pose_part]
+        centre = problem.pose.mean.apply(problem.pose.centre[None])[0]
+        places = problem.observed.body.points + state.displacement + problem.correction(trial)
+        in_camera = problem.pose.mean.moved_jacobian(places, twist, centre).reshape(-1, 3, 6)
+        blocks.append(np.einsum("ji,njk->nik", trial.pose.rotation, in_camera).reshape(-1, 6) * problem.pose.deviations)
+    rest = np.zeros(len(problem.observed.body.points))
+    if problem.error is not None:
+        blocks.append(problem.error.size * problem.error.discrepancy.modes)
+        rest = problem.error.size * problem.error.discrepancy.rest
+    values, vectors = np.linalg.eigh(posterior.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return Uncertainty(np.hstack([np.hstack(blocks) @ root, posterior.scales.force * unseen]), rest)

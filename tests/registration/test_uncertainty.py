@@ -1,0 +1,127 @@
+"""Margins of where things are: they cover the truth as often as they say, and grow with what is not seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.embedding import embed
+from softtwin.registration.evidence import Scale
+from softtwin.registration.forward import reduce_model
+from softtwin.registration.pose import Pose
+from softtwin.registration.registrar import Registrar, RegistrationOptions, prepare
+from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.uncertainty import Uncertainty, unseen_response
+from softtwin.registration.unknowns import PosePrior, nodal_forces
+
+from .conftest import Cantilever, cloud_on
+
+NOISE, FORCE = 2e-3, 0.03
+
+
+def registrar(body: Body, pose: PosePrior | None = None) -> Registrar:
+    observed = SurfaceDistance(body, body.surfaces["observed"])
+    forces = nodal_forces(body, body.node_sets["tip"], Scale(FORCE, 0.0))
+    options = RegistrationOptions(noise=Scale(NOISE, 0.0))
+    return Registrar(Cantilever(body), observed, forces, options, pose=pose)
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.9, 0.95])
+def test_margins_cover_the_truth_as_often_as_they_say(body: Body, confidence: float) -> None:
+    """Forces as the prior has them, 150 clouds: three standard deviations of a binomial share."""
+    made, inner = registrar(body), embed(body, np.array([[0.6, 0.1, 0.1]]))
+    kept = []
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        forces = made.forces.forces(FORCE * rng.standard_normal(made.forces.size))
+        truth = made.model.solve(forces).displacement
+        result = made.register(cloud_on(body, truth, 200, rng, NOISE))
+        away = np.linalg.norm(inner.displace(result.displacement - truth)[0])
+        kept.append(away <= result.uncertainty.margin(inner, confidence)[0])
+    assert abs(np.mean(kept) - confidence) < 3.0 * np.sqrt(confidence * (1.0 - confidence) / 150) + 0.02
+
+
+def test_the_margin_of_a_normal_law_is_its_quantile(rng: np.random.Generator) -> None:
+    factor = rng.standard_normal((3, 4)) * np.array([3.0, 1.0, 0.3])[:, None]
+    law = Uncertainty(factor, np.array([0.2]))
+    drawn = rng.standard_normal((200_000, 4)) @ factor.T + 0.2 * rng.standard_normal((200_000, 3))
+    lengths = np.linalg.norm(drawn, axis=1)
+    for confidence in (0.5, 0.9, 0.95, 0.99):
+        assert law.margin(confidence=confidence)[0] == pytest.approx(np.quantile(lengths, confidence), rel=0.05)
+    assert law.deviation[0] == pytest.approx(np.sqrt((lengths**2).mean()), rel=0.01)
+    with pytest.raises(ValueError, match=r"confidence: expected a number in \(0, 1\), got 1\.0"):
+        law.margin(confidence=1.0)
+
+
+def test_what_cannot_move_is_certain(body: Body, rng: np.random.Generator) -> None:
+    made = registrar(body)
+    truth = made.model.solve(made.forces.forces(FORCE * rng.standard_normal(made.forces.size))).displacement
+    known = made.register(cloud_on(body, truth, 200, rng, NOISE)).uncertainty
+    assert known.deviation[body.fixed].max() == 0.0 and known.margin()[body.fixed].max() == 0.0
+    assert known.deviation[body.node_sets["tip"]].min() > 0.0
+
+
+def test_more_points_and_less_noise_make_it_surer(body: Body) -> None:
+    made = registrar(body)
+    truth = made.model.solve(made.forces.forces(np.full(made.forces.size, 0.5 * FORCE))).displacement
+    sizes = [
+        made.register(cloud_on(body, truth, count, np.random.default_rng(1), NOISE)).uncertainty.deviation.mean()
+        for count in (50, 800)
+    ]
+    assert sizes[1] < 0.5 * sizes[0]
+
+
+def test_an_unknown_pose_adds_to_it(body: Body, rng: np.random.Generator) -> None:
+    prior = PosePrior(Pose.identity(), body.points.mean(axis=0), np.deg2rad(5.0), 0.01)
+    plain, posed = registrar(body), registrar(body, prior)
+    truth = plain.model.solve(plain.forces.forces(np.full(plain.forces.size, 0.5 * FORCE))).displacement
+    cloud = cloud_on(body, truth, 300, rng, NOISE)
+    known, unknown = (made.register(cloud).uncertainty for made in (plain, posed))
+    assert unknown.deviation[body.fixed].min() > 0.0
+    assert unknown.deviation.mean() > known.deviation.mean()
+
+
+def test_directions_that_were_left_out_are_doubted_still(body: Body, rng: np.random.Generator) -> None:
+    """Half of the directions are left out: with what they would do, the covariance at rest is that of all."""
+    model, observed = Cantilever(body), SurfaceDistance(body, body.surfaces["observed"])
+    every = nodal_forces(body, body.node_sets["tip"], Scale(FORCE, 0.0), 0.05)
+    turned, _ = np.linalg.qr(rng.standard_normal((every.size, every.size)))
+    some = every.combined(turned[:, : every.size // 2])
+    response = unseen_response(reduce_model(model, observed.nodes, some.basis), some)
+    at_rest = model.solve(np.zeros_like(body.points))
+    whole = at_rest.push(every.basis)
+    both = np.hstack([at_rest.push(some.basis), response])
+    np.testing.assert_allclose(both @ both.T, whole @ whole.T, atol=1e-12 * np.abs(whole @ whole.T).max())
+    fewer = some.combined(np.eye(some.size)[:, :2])
+    response = unseen_response(reduce_model(model, observed.nodes, fewer.basis), fewer)
+    both = np.hstack([at_rest.push(fewer.basis), response])
+    np.testing.assert_allclose(both @ both.T, whole @ whole.T, atol=1e-12 * np.abs(whole @ whole.T).max())
+    assert unseen_response(reduce_model(model, observed.nodes, every.basis), every).shape == (body.points.size, 0)
+
+
+def test_many_directions_are_stood_for_by_random_ones(body: Body) -> None:
+    model, observed = Cantilever(body), SurfaceDistance(body, body.surfaces["observed"])
+    every = nodal_forces(body, body.boundary_nodes, Scale(FORCE, 0.0))
+    assert every.size > 200
+    few = every.combined(np.eye(every.size)[:, :3])
+    response = unseen_response(reduce_model(model, observed.nodes, few.basis), few)
+    assert response.shape == (body.points.size, 64)
+    exact = model.solve(np.zeros_like(body.points)).push(few.unseen)
+    ratio = np.trace(response @ response.T) / np.trace(exact @ exact.T)
+    assert 0.5 < ratio < 1.6
+
+
+def test_prepared_registrations_have_it(body: Body, rng: np.random.Generator) -> None:
+    made = prepare(Cantilever(body), body.boundary_nodes, body.surfaces["observed"], force_scale=0.01)
+    made = replace_options(made)
+    truth = made.model.solve(made.forces.forces(np.full(made.forces.size, 0.02))).displacement
+    result = made.register(cloud_on(body, truth, 300, rng, 1e-3))
+    assert np.isfinite(result.uncertainty.deviation).all() and result.uncertainty.deviation.max() > 0.0
+
+
+def replace_options(made: Registrar) -> Registrar:
+    options = replace(made.options, gathering=replace(made.options.gathering, rounds=1))
+    return Registrar(made.model, made.observed, made.forces, options)
