@@ -69,6 +69,7 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
         "rows": shown,
         "unlisted": len(rows) - len(shown),
         "targets": list(body.inner),
+        "drafted": any("draft" in row for row in rows),
         "bounded": next((row["network"]["confidence"] for row in rows if "network" in row), None),
         "pictures": _pictures(folder, body, place, rows, studio),
         "legend": [(ORGAN, "organ"), *((inner_colours(body.inner)[name], name) for name in body.inner)],

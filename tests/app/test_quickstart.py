@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista
 
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 pytest.importorskip("torch", reason="torch is absent")
@@ -102,6 +103,34 @@ def test_the_twin_registers_a_sequence_without_the_reference(made: Path, tmp_pat
     frames = json.loads((output / "registration.json").read_text())["frames"]
     assert max(frame["rms_distance_m"] for frame in frames) < 3e-3
     assert {"frame_0001.vtu", "tumour_0001.vtp", "frames.pvd"} <= {path.name for path in output.iterdir()}
+
+
+def test_the_hybrid_engine_is_nearer_and_surer_than_the_network(copy: Path, capsys) -> None:
+    cloud, body = copy / "demo" / "cloud.npy", read_body(copy / "body.vtu")
+    np.save(copy / "truth.npy", body.points + np.load(copy / "demo" / "truth.npy"))
+    rows = {}
+    for engine in ("surrogate", "hybrid"):
+        folder = copy / f"by-{engine}"
+        arguments = ("register", copy, cloud, "--engine", engine, "--truth", copy / "truth.npy", "--output", folder)
+        assert softtwin(*arguments) == 0
+        record = json.loads((folder / "registration.json").read_text())
+        assert record["options"]["model"] == engine
+        (rows[engine],) = record["frames"]
+        assert rows[engine]["verdict"] == "accepted"
+        assert rows[engine]["network"]["mean_error_bound_m"] > 0.0
+        grid = pyvista.read(folder / "frame_0000.vtu")
+        assert grid.point_data["deviation"].shape == (len(body.points),) and grid.point_data["deviation"].min() >= 0.0
+        for target in rows[engine]["targets"].values():
+            assert 0.0 < target["error_m"] < target["margin95_m"] < target["movement_m"]
+    assert "draft" not in rows["surrogate"]
+    draft = rows["hybrid"]["draft"]
+    assert 0.0 < draft["mean_distance_m"] < draft["largest_distance_m"] < 5e-3
+    assert rows["hybrid"]["error"]["mean"] < rows["surrogate"]["error"]["mean"]
+    assert rows["hybrid"]["deviation_m"]["mean"] < rows["surrogate"]["deviation_m"]["mean"]
+    assert softtwin("report", copy / "organ.toml") == 0
+    page = (copy / "report.html").read_text()
+    assert "with the hybrid engine" in page and "reference and network apart" in page and "95 % margin" in page
+    assert "tumour moved" in capsys.readouterr().out
 
 
 def test_validate_and_report_run_alone(copy: Path, capsys) -> None:
