@@ -29,6 +29,7 @@ from softtwin.reference.data.dataset import LinearResponse, create, write_block
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registration
+from softtwin.registration.uncertainty import Uncertainty
 from softtwin.registration.verdict import Judgement, Verdict
 
 SPLITS = {"train": 4, "validation": 2, "test": 2}
@@ -181,7 +182,10 @@ def make_registration(folder: Path, body: Body, frames: int = 4) -> None:
                 evaluations=5,
                 seconds=0.1,
                 trace=(),
+                problem=None,  # type: ignore[arg-type]
+                posterior=None,  # type: ignore[arg-type]
             )
+            vars(result)["uncertainty"] = Uncertainty(1e-3 * np.ones((shape.size, 1)), np.zeros(len(shape)))
             recorder.add(Frame(number, verdict, result, 0.1, body.points + shape), f"cloud_{number}.ply")
         recorder.add(Frame(frames, Judgement(Verdict.REFUSED, ("an empty cloud.",)), None, 0.0), "empty.ply")
 
