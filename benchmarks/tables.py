@@ -143,13 +143,18 @@ def hybrid() -> None:
         )
 
 
+def _kept_inside(outside: dict[str, Any]) -> str:
+    inside = outside.get("times_3_inside")
+    return "-" if not inside or inside["kept"] is None else f"{100 * inside['kept']:.0f} % of {inside['loads']}"
+
+
 def certificates() -> None:
     """Bounds on errors, by range of size from the smallest to the largest."""
     found = figures("certificates")
     if not found:
         return
     ranges = "; by size"
-    head("certificates", f"kept, mean error, %{ranges}", f"width / median error{ranges}", "rank", "outside %: 1 x; 3 x",
+    head("certificates", f"kept, mean error, %{ranges}", f"width / median error{ranges}", "rank", "outside %: 1 x; 3 x; of 3 x inside kept",
          "Newton step: rank; indefinite", "ms: prediction; distance; certificate; Newton step")  # fmt: skip
     for body, f in found.items():
         held, ms, newton = f["held_out"], f["ms"], f["newton_step"]
@@ -158,7 +163,7 @@ def certificates() -> None:
             f"{100 * held['kept']['mean']:.1f}; " + " / ".join(f"{100 * k:.1f}" for k in held["kept_in_range"]["mean"]),
             " / ".join(f"{width:.2f}" for width in held["widths"]["mean"]),
             f"{held['rank_correlation']['mean']:.3f}",
-            f"{100 * f['outside']['times_1']:.1f}; {100 * f['outside']['times_3']:.1f}",
+            f"{100 * f['outside']['times_1']:.1f}; {100 * f['outside']['times_3']:.1f}; {_kept_inside(f['outside'])}",
             f"{newton['rank_correlation']:.3f}; {newton['indefinite']} of {newton['samples']}",
             "; ".join(f"{ms[name]:.2f}" for name in ("prediction", "distance", "step", "newton")),
         )
