@@ -154,8 +154,15 @@ def certificates() -> None:
     if not found:
         return
     ranges = "; by size"
-    head("certificates", f"kept, mean error, %{ranges}", f"width / median error{ranges}", "rank", "outside %: 1 x; 3 x; of 3 x inside kept",
-         "Newton step: rank; indefinite", "ms: prediction; distance; certificate; Newton step")  # fmt: skip
+    head(
+        "certificates",
+        f"kept, mean error, %{ranges}",
+        f"width / median error{ranges}",
+        "rank",
+        "outside %: 1 x; 3 x; of 3 x inside kept",
+        "Newton step: rank; indefinite",
+        "ms: prediction; distance; certificate; Newton step",
+    )
     for body, f in found.items():
         held, ms, newton = f["held_out"], f["ms"], f["newton_step"]
         row(
