@@ -227,6 +227,9 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
     "--format", "formats", multiple=True, help="stl, ply, vtp: surfaces; vtu: all (may be repeated).  [vtu, vtp]"
 )
 @click.option("--truth", type=_EXISTING, help="True node positions in .npy, metres, (frames, n, 3), to state errors.")
+@click.option("--budget", type=float, help="Seconds for a frame, after which the best so far is taken.")
+@click.option("--watch", is_flag=True, help="CLOUDS is a folder that is written to: register the newest, until Ctrl-C.")
+@click.option("--idle", type=float, help="With --watch: end after so many seconds without a new cloud.")
 @click.option("--strict", is_flag=True, help="End with code 3 unless every frame is accepted.")
 @click.option("--output", type=_PATH, default=Path("registration"), show_default=True, help="Folder of the results.")
 def register(
@@ -238,6 +241,9 @@ def register(
     align: str | None,
     formats: tuple[str, ...],
     truth: Path | None,
+    budget: float | None,
+    watch: bool,
+    idle: float | None,
     strict: bool,
     output: Path,
     **chosen: Any,
@@ -260,9 +266,22 @@ def register(
         raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
     options = {name: value for name, value in chosen.items() if value is not None}
     start = Start(matrix, landmarks or None, align is not None)
-    verdicts = register_files(
-        twin, clouds, output, options, unit=unit, start=start, truth=truth, formats=formats, say=click.echo
-    )
+    if idle is not None and not watch:
+        raise ConfigError("--idle: expected --watch beside it.")
+    if watch:
+        from .streams import watch_folder
+
+        if len(clouds) != 1 or truth is not None:
+            raise ConfigError("--watch: expected one folder and no --truth.")
+        verdicts = watch_folder(
+            twin, Path(clouds[0]), output, options, unit=unit, start=start, formats=formats, budget=budget, idle=idle,
+            say=click.echo,
+        )  # fmt: skip
+    else:
+        verdicts = register_files(
+            twin, clouds, output, options, unit=unit, start=start, truth=truth, formats=formats, budget=budget,
+            say=click.echo,
+        )  # fmt: skip
     said = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items() if count)
     click.echo(f"{said}; written to {output}\n{NOTICE}")
     if strict and verdicts["doubtful"] + verdicts["refused"]:

@@ -52,15 +52,16 @@ class Recorder:
     def __exit__(self, *error: object) -> None:
         self.write()
 
-    def add(self, frame: Frame, cloud: str = "") -> dict[str, Any]:
+    def add(self, frame: Frame, cloud: str = "", **more: Any) -> dict[str, Any]:
         """Write a frame's files and enter its figures, which are returned.
 
         Args:
             frame: the frame.
             cloud: name of the cloud's file.
+            **more: further figures of it.
         """
         row: dict[str, Any] = {"frame": frame.number, "cloud": cloud, "verdict": frame.judgement.verdict.value}
-        row |= {"reasons": list(frame.judgement.reasons), "seconds": frame.seconds, "files": []}
+        row |= {"reasons": list(frame.judgement.reasons), "seconds": frame.seconds, "files": [], **more}
         if frame.registration is not None:
             truth = None if self.truth is None else self.truth[frame.number]
             row |= frame_figures(self.exporter.twin, frame.registration, truth)
@@ -187,6 +188,9 @@ def describe(row: Mapping[str, Any]) -> str:
     force, doubt = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
     line += f", cloud to surface {millimetres(row['rms_distance_m'])}, net force {force:.3f} ± {doubt:.3f} N"
     line += f", {1e3 * row['seconds']:.0f} ms"
+    if "age_s" in row:
+        line += f", {1e3 * row['age_s']:.0f} ms old{' (late)' if row['is_late'] else ''}"
+        line += f", {row['dropped']} dropped" if row["dropped"] else ""
     if "error" in row:
         line += f", error {millimetres(row['error']['mean'])}"
     for name, target in row["targets"].items():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import glob
+import math
 import re
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +30,7 @@ from .record import Recorder, counts, describe, millimetres
 from .twin import Camera, Frame, Twin, coordinates_of
 
 Floats = NDArray[np.float64]
-_CLOUDS = (".npy", ".txt", ".csv", ".xyz", ".ply", ".stl", ".obj", ".vtk", ".vtp", ".vtu", ".pcd")
+CLOUDS = (".npy", ".txt", ".csv", ".xyz", ".ply", ".stl", ".obj", ".vtk", ".vtp", ".vtu", ".pcd")
 _FAR_OFF = 0.25  # body sizes that fixed nodes of a truth may be off on average
 
 
@@ -80,19 +82,19 @@ def _files_of(name: str) -> list[Path]:
     if path.is_file():
         return [path]
     if path.is_dir():
-        found = [file for file in path.iterdir() if file.suffix.lower() in _CLOUDS]
+        found = [file for file in path.iterdir() if file.suffix.lower() in CLOUDS]
         if not found:
-            raise FileError(f"{path}: expected clouds in this folder ({', '.join(_CLOUDS)}), found none.")
+            raise FileError(f"{path}: expected clouds in this folder ({', '.join(CLOUDS)}), found none.")
     elif glob.has_magic(name):
         found = [Path(file) for file in glob.glob(name, recursive=True) if Path(file).is_file()]
         if not found:
             raise FileError(f"{name}: expected a pattern of files, found none that matches.")
     else:
         raise FileError(f"{name}: expected a cloud, a folder of clouds or a pattern in quotes, found nothing there.")
-    return sorted(found, key=lambda file: _by_numbers(str(file)))
+    return sorted(found, key=lambda file: by_numbers(str(file)))
 
 
-def _by_numbers(name: str) -> list[tuple[int, str]]:
+def by_numbers(name: str) -> list[tuple[int, str]]:
     """A key by which cloud_2 comes before cloud_10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
@@ -203,6 +205,7 @@ def register_files(
     start: Start | None = None,
     truth: Path | None = None,
     formats: tuple[str, ...] = (),
+    budget: float | None = None,
     say: Callable[[str], None] = print,
 ) -> dict[str, int]:
     """Register the clouds in files to the twin in a folder; returns how many frames bear each verdict.
@@ -216,6 +219,7 @@ def register_files(
         start: where the camera stands; in the body's coordinates if not given.
         truth: file of true node positions.
         formats: of the files of each frame; VTU and VTP if none.
+        budget: seconds for a frame, after which no step is begun; no limit if not given.
         say: prints a line.
 
     Raises:
@@ -226,19 +230,35 @@ def register_files(
     outside = replace(inside, unit=unit or inside.unit)
     clouds = find_clouds(names, outside)
     positions = None if truth is None else read_truth(truth, len(clouds), home.body, inside)
-    start = start or Start()
-    pose = None
+    pose = start_pose(start or Start(), inside, outside, say)
+    with home.twin(**options) as twin:
+        camera: Camera = "align" if start and start.align else camera_of(twin, pose)
+        chosen = formats or WRITTEN
+        rows = register_clouds(
+            twin, clouds, output, camera=camera, truth=positions, formats=chosen, budget=budget, say=say
+        )
+    return counts(rows)
+
+
+def start_pose(start: Start, inside: Coordinates, outside: Coordinates, say: Callable[[str], None]) -> Pose | None:
+    """The pose that a person has given; None where none was.
+
+    Args:
+        start: what was given.
+        inside: coordinates of the body's files.
+        outside: of the clouds' files.
+        say: prints a line.
+
+    Raises:
+        FileError, PoseError: it cannot be read.
+    """
     if start.matrix is not None:
-        pose = camera_from_matrix(start.matrix, outside)
+        return camera_from_matrix(start.matrix, outside)
     if start.landmarks is not None:
         fit = camera_from_landmarks(*start.landmarks, inside, outside)
         say(describe_landmarks(fit))
-        pose = fit.pose
-    with home.twin(**options) as twin:
-        camera: Camera = "align" if start.align else camera_of(twin, pose)
-        chosen = formats or WRITTEN
-        rows = register_clouds(twin, clouds, output, camera=camera, truth=positions, formats=chosen, say=say)
-    return counts(rows)
+        return fit.pose
+    return None
 
 
 def camera_of(twin: Twin, pose: Pose | None) -> Pose | PosePrior | None:
@@ -263,6 +283,7 @@ def register_clouds(
     camera: Camera = None,
     truth: Floats | None = None,
     formats: tuple[str, ...] = WRITTEN,
+    budget: float | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
     """Register a sequence and write each frame as it is found; returns the figures of all frames.
@@ -275,33 +296,70 @@ def register_clouds(
         camera: where the camera stands.
         truth: true node positions of each frame, (frames, n, 3), metres, to state errors.
         formats: of the files of each frame.
+        budget: as for `register_files`.
         say: prints one line a frame.
 
     Raises:
         CloudError: none of the clouds could be registered at all; their frames are written all the same.
+        ConfigError: a budget that is no positive number.
     """
+    check_budget(budget)
     sequence = twins.Sequence(twin, zone, camera)
     with (
         Recorder(Exporter(twin, output, formats), zone, truth) as recorder,
         tqdm(total=len(clouds), desc="registering", unit="frame", disable=None) as bar,
     ):
         for cloud in clouds:
-            row = recorder.add(_registered(sequence, cloud), cloud.path.name if isinstance(cloud, CloudFile) else "")
+            until = math.inf if budget is None else time.monotonic() + budget
+            row = recorder.add(registered(sequence, cloud, until), name_of(cloud))
             with tqdm.external_write_mode():
                 say(describe(row))
             bar.update()
-    if recorder.rows and all("outcome" not in row for row in recorder.rows):
-        first = recorder.rows[0]
-        name = f"{first['cloud']}: " if first["cloud"] else ""
-        raise CloudError(f"no cloud could be registered; the first: {name}{first['reasons'][0]}")
+    check_any(recorder.rows)
     return recorder.rows
 
 
-def _registered(sequence: twins.Sequence, cloud: CloudFile | ArrayLike) -> Frame:
+def check_budget(budget: float | None) -> None:
+    """Refuse seconds for a frame that are no positive number.
+
+    Raises:
+        ConfigError: they are not.
+    """
+    if budget is not None and not 0.0 < budget < math.inf:
+        raise ConfigError(f"--budget: expected a positive time in seconds, got {budget}.")
+
+
+def check_any(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse a sequence of which nothing could be registered.
+
+    Args:
+        rows: figures of its frames.
+
+    Raises:
+        CloudError: with the first frame's reason.
+    """
+    if rows and all("outcome" not in row for row in rows):
+        name = f"{rows[0]['cloud']}: " if rows[0]["cloud"] else ""
+        raise CloudError(f"no cloud could be registered; the first: {name}{rows[0]['reasons'][0]}")
+
+
+def name_of(cloud: CloudFile | ArrayLike) -> str:
+    """Of a cloud's file; empty for points."""
+    return cloud.path.name if isinstance(cloud, CloudFile) else ""
+
+
+def registered(sequence: twins.Sequence, cloud: CloudFile | ArrayLike, until: float = math.inf) -> Frame:
+    """The next frame of a sequence; refused, with the reason, where its file cannot be read.
+
+    Args:
+        sequence: the sequence.
+        cloud: a file, or points (p, 3) in metres.
+        until: as for `Sequence.register`.
+    """
     if not isinstance(cloud, CloudFile):
-        return sequence.register(cloud)
+        return sequence.register(cloud, until)
     try:
         points = cloud.read()
     except FileError as error:  # it could be read a moment ago, or holds nothing to register
         return sequence.refuse(str(error).removeprefix(f"{cloud.path}: "))  # the frame says which file it is
-    return sequence.register(points)
+    return sequence.register(points, until)

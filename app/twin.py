@@ -215,9 +215,23 @@ class Twin:
             camera = self.aligned(cloud)
         return self._posed_result(cloud, zone, camera, lambda registrar, points: registrar.register(points, start))
 
-    def follow(self, cloud: ArrayLike, zone: str | None, last: Registration | None, camera: Camera) -> Registration:
-        """A cloud registered from the last frame, and from rest where that is not accepted; see `Registrar.follow`."""
-        return self._posed_result(cloud, zone, camera, lambda registrar, points: registrar.follow(points, last))
+    def follow(
+        self, cloud: ArrayLike, zone: str | None, last: Registration | None, camera: Camera, until: float = np.inf
+    ) -> Registration:
+        """A cloud registered from the last frame, and from rest where that is not accepted; see `Registrar.follow`.
+
+        Args:
+            cloud: as for `register`.
+            zone: as for `register`.
+            last: result of the last usable frame.
+            camera: where the camera stands.
+            until: no step is begun after this time of the monotonic clock, seconds.
+        """
+
+        def run(registrar: Engine, points: Floats) -> Registration:
+            return (registrar.limited(until) if until < np.inf else registrar).follow(points, last)
+
+        return self._posed_result(cloud, zone, camera, run)
 
     def _posed_result(
         self, cloud: ArrayLike, zone: str | None, camera: Camera, run: Callable[[Engine, Floats], Registration]
@@ -361,14 +375,19 @@ class Sequence:
         self._count = 0
         twin.registrar(zone)  # a zone that is not there is said before the first cloud
 
-    def register(self, cloud: ArrayLike) -> Frame:
-        """The next frame; refused, with the reason, where the cloud cannot be registered."""
+    def register(self, cloud: ArrayLike, until: float = np.inf) -> Frame:
+        """The next frame; refused, with the reason, where the cloud cannot be registered.
+
+        Args:
+            cloud: (p, 3), metres.
+            until: no step is begun after this time of the monotonic clock, seconds: the result is the best so far.
+        """
         begin = time.perf_counter()
         points = self._thinned(cloud)
         try:
             if self.camera == "align":
                 self.camera = self.twin.aligned(points)
-            result = self.twin.follow(points, self.zone, self._last, self.camera)
+            result = self.twin.follow(points, self.zone, self._last, self.camera, until)
         except (CloudError, NotConverged) as error:
             return self.refuse(str(error), time.perf_counter() - begin)
         if result.judgement.is_usable:

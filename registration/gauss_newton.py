@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -89,6 +90,7 @@ class GaussNewton:
         least_step: no step that moves all observed nodes less than this is tried, metres.
         trusted: before the end closest points are searched anew, of points further from the surface than so many of
             their deviations; 0 for all.
+        until: no step is begun after this time of the monotonic clock, seconds.
     """
 
     losses: tuple[Loss, ...] = (Huber(), Tukey())
@@ -100,6 +102,7 @@ class GaussNewton:
     max_step: float = 16e-3
     least_step: float = 1e-6
     trusted: float = 0.0
+    until: float = np.inf
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
@@ -164,11 +167,12 @@ class _Search:
 
     def run(self) -> Found:
         options = self.options
-        for loss in options.losses[:-1]:
-            self._descend(loss, options.handed_on)
+        ended = [self._descend(loss, options.handed_on) for loss in options.losses[:-1]]
         outcome = self._descend(options.losses[-1], options.settled)
-        if outcome in (Outcome.NO_DESCENT, Outcome.MOST_ITERATIONS) and self._has_enough():
+        if outcome in (Outcome.NO_DESCENT, Outcome.MOST_ITERATIONS, Outcome.OUT_OF_TIME) and self._has_enough():
             outcome = Outcome.CONVERGED
+        if Outcome.OUT_OF_TIME in ended:  # far off, the last loss takes all points for outliers, and is content
+            outcome = Outcome.OUT_OF_TIME
         local = self._local(self.options.losses[-1])
         return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
 
@@ -191,6 +195,8 @@ class _Search:
                 is_exact = True
                 continue
             is_exact = False
+            if time.monotonic() >= self.options.until:
+                return Outcome.OUT_OF_TIME
             refused = self._step(local, loss)
             if refused is not None:
                 return refused

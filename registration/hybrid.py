@@ -34,6 +34,13 @@ class HybridRegistrar:
         """The exact forward model."""
         return self.exact.model
 
+    def limited(self, until: float) -> HybridRegistrar:
+        """The same, which begins no step after a time of the monotonic clock, seconds; see `Registrar.limited`.
+
+        Where the exact model has not ended by then, the better one of both results is given.
+        """
+        return HybridRegistrar(self.fast.limited(until), self.exact.limited(until))
+
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud; see `Registrar.register`.
 
@@ -48,12 +55,24 @@ class HybridRegistrar:
         return self._refined(cloud, lambda: self.fast.follow(cloud, None if last is None else last.draft))
 
     def _refined(self, cloud: ArrayLike, drafted: Callable[[], Registration]) -> Registration:
-        begin, found = time.perf_counter(), None
+        begin = time.perf_counter()
         draft = drafted()
-        if draft.judgement.is_usable:
+        draft = replace(draft, draft=draft)
+        return replace(self._best(cloud, draft), seconds=time.perf_counter() - begin)
+
+    def _best(self, cloud: ArrayLike, draft: Registration) -> Registration:
+        """The exact model's result, from the draft or from rest; where time was over before, the better of both."""
+        refined = None
+        if draft.judgement.is_usable and not self._is_late:
             with suppress(NotConverged):
-                found = self.exact.refine(cloud, draft)
-        if found is None or found.judgement.verdict is not Verdict.ACCEPTED:
+                refined = self.exact.refine(cloud, draft)
+        if refined is not None and refined.judgement.verdict is Verdict.ACCEPTED:
+            return refined
+        if not self._is_late:
             alone = replace(self.exact.register(cloud), draft=draft)
-            found = alone if found is None else min(found, alone, key=badness)
-        return replace(found, seconds=time.perf_counter() - begin)
+            return alone if refined is None else min(refined, alone, key=badness)
+        return draft if refined is None else min(draft, refined, key=badness)
+
+    @property
+    def _is_late(self) -> bool:
+        return time.monotonic() >= self.exact.options.solver.until

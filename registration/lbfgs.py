@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,12 +31,14 @@ class LBFGS:
         max_iterations: of one run.
         memory: pairs that the Hessian is built from.
         tolerance: relative fall of the objective below which a run ends.
+        until: no state is looked for after this time of the monotonic clock, seconds.
     """
 
     losses: tuple[Loss, ...] = (Huber(), Huber(), Tukey())
     max_iterations: int = 200
     memory: int = 30
     tolerance: float = 1e-9
+    until: float = np.inf
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1 or self.memory < 1:
@@ -85,6 +88,10 @@ class LBFGS:
         return _Run(self, problem, start, near).found()
 
 
+class _TimeIsOver(Exception):  # noqa: N818 - no error
+    """Leaves SciPy's loop."""
+
+
 class _Run:
     def __init__(self, options: LBFGS, problem: Problem, start: Floats, near: Trial | None) -> None:
         self.options, self.problem = options, problem
@@ -111,6 +118,8 @@ class _Run:
 
         def evaluate(scaled: Floats) -> tuple[float, Floats]:
             nonlocal least, met_wall
+            if time.monotonic() >= self.options.until:
+                raise _TimeIsOver
             self.evaluations += 1
             try:
                 trial = problem.trial(root * scaled, self.trial, anew=True)
@@ -124,12 +133,17 @@ class _Run:
             return value, root * gradient + scaled
 
         limits = {"maxiter": self.options.max_iterations, "ftol": self.options.tolerance, "maxcor": self.options.memory}
-        done = minimize(evaluate, self.trial.coefficients / root, jac=True, method="L-BFGS-B", options=limits)
+        try:
+            done = minimize(evaluate, self.trial.coefficients / root, jac=True, method="L-BFGS-B", options=limits)
+        except _TimeIsOver:
+            done = None
         moved = float(problem.moved(self.trial, self.best.coefficients - self.trial.coefficients).max())
         self.trial = self.best
         self.trace.append(
             Step(self.trial.match.rms, least, scales.noise, scales.force, moved, float("nan"), float("nan"))
         )
+        if done is None:
+            return Outcome.OUT_OF_TIME
         if done.success:
             return Outcome.CONVERGED
         if done.status == 1:

@@ -12,6 +12,7 @@ class Outcome(Enum):
     NO_DESCENT = "no step lowers the objective"
     REFUSED = "the model finds no state further on"
     MOST_ITERATIONS = "most iterations reached"
+    OUT_OF_TIME = "the time for it was over"
 
     @property
     def is_success(self) -> bool:
@@ -29,4 +30,5 @@ _ADVICE = {
     Outcome.NO_DESCENT: "start from another frame's result or a better pose; look whether cloud and organ match.",
     Outcome.REFUSED: "the forces that the cloud asks for leave what the model can solve: check pose and stiffness.",
     Outcome.MOST_ITERATIONS: "raise max_iterations, or start from the result of this frame.",
+    Outcome.OUT_OF_TIME: "this is the best so far; allow more time a frame, or take a faster engine.",
 }

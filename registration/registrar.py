@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -262,6 +263,13 @@ class Registrar:
         self._everywhere = Prepared.of(model, observed, forces)
         self._thorough = self.options.solver.settling(self.options.thorough)
 
+    def limited(self, until: float) -> Registrar:
+        """The same, which begins no step after a time of the monotonic clock, seconds, and gives the best so far."""
+        other = copy.copy(self)
+        other.options = replace(self.options, solver=replace(self.options.solver, until=until))
+        other._thorough = replace(self._thorough, until=until)
+        return other
+
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud.
 
@@ -329,7 +337,7 @@ class Registrar:
         except NotConverged:
             return self.register(cloud)
         began_anew = warm.prepared is not last.prepared
-        if warm.judgement.verdict is Verdict.ACCEPTED or began_anew:
+        if warm.judgement.verdict is Verdict.ACCEPTED or began_anew or time.monotonic() >= self.options.solver.until:
             return warm
         return min(warm, self.register(cloud), key=badness)
 
@@ -402,6 +410,8 @@ class Registrar:
         return prepared.believing(belief.spread)
 
     def _is_hopeless(self, found: Found) -> bool:
+        if found.outcome is Outcome.OUT_OF_TIME:  # who knows
+            return False
         return found.posterior.scales.noise > _HOPELESS * self.expectations.noise
 
     def _doubted(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from softtwin.meshes.clouds import CloudError
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.evidence import Scale
 from softtwin.registration.hybrid import HybridRegistrar
+from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registrar, RegistrationOptions, register_sequence
 from softtwin.registration.residuals import SurfaceDistance
@@ -126,6 +128,31 @@ def test_nonsense_of_the_fast_model_is_left_aside(body: Body, truth: np.ndarray,
     found = both.register(cloud_on(body, truth, 300, rng, 5e-4))
     assert found.judgement.verdict is Verdict.ACCEPTED
     assert np.abs(found.displacement - truth)[:, 1:].max() < 1e-3
+
+
+def test_where_time_is_over_the_better_of_both_is_given(body: Body, truth: np.ndarray, rng) -> None:
+    cloud = cloud_on(body, truth, 300, rng, 5e-4)
+    fast, exact = Bent(body, 1.1), Bent(body)
+    both = engine(fast, exact)
+    late = both.limited(time.monotonic() - 1.0).register(cloud)
+    assert exact.asked == 0 and late.outcome is Outcome.OUT_OF_TIME and late.judgement.verdict is not Verdict.ACCEPTED
+
+    class Slow(Bent):
+        """Takes so long that the time is over after its first state."""
+
+        def solve(self, forces: ArrayLike, near: Any = None) -> CantileverState:
+            time.sleep(max(0.0, limit - time.monotonic()))
+            return super().solve(forces, near)
+
+    limit = np.inf
+    slow = engine(Bent(body, 1.1), Slow(body))
+    draft = slow.fast.register(cloud)
+    limit = time.monotonic() + 0.5
+    found = slow.limited(limit).register(cloud)
+    assert slow.exact.model.asked <= 1
+    assert found.judgement.verdict is Verdict.ACCEPTED  # the draft: the exact model came no further than its start
+    np.testing.assert_allclose(found.net_force, draft.net_force)
+    assert found.draft is not None and both.limited(np.inf).register(cloud).judgement.verdict is Verdict.ACCEPTED
 
 
 def test_a_cloud_of_something_else_is_refused_by_both(body: Body, rng) -> None:

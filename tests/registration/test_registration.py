@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -49,6 +51,17 @@ def test_a_known_force_is_recovered(body: Body, rng, solver: GaussNewton | LBFGS
     assert np.abs(result.displacement - truth)[:, 1:].max() < 5e-4
     idle = np.setdiff1d(np.arange(len(body.points)), body.node_sets["tip"])
     assert np.abs(result.forces[idle]).max() == 0.0
+
+
+@pytest.mark.parametrize("solver", [GaussNewton(), LBFGS()])
+def test_a_search_whose_time_is_over_says_so(body: Body, rng, solver: GaussNewton | LBFGS) -> None:
+    truth = Cantilever(body).solve(tip_forces(body, NET)).displacement
+    made, cloud = registrar(body, solver), cloud_on(body, truth, 300, rng)
+    late = made.limited(time.monotonic() - 1.0).register(cloud)
+    assert late.outcome is Outcome.OUT_OF_TIME and late.judgement.verdict is not Verdict.ACCEPTED
+    assert made.register(cloud).outcome is Outcome.CONVERGED  # the other is as it was
+    found = made.limited(time.monotonic() + 600.0).register(cloud)
+    np.testing.assert_array_equal(found.net_force, made.register(cloud).net_force)
 
 
 @pytest.mark.parametrize("noise", [1e-3, 5e-3])
