@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -179,9 +180,22 @@ def test_a_closed_twin_says_so(mesh_folder: Path) -> None:
     assert len(twin.body.points) == len(rest)
 
 
-def test_the_five_lines_of_the_guide_run(small_quickstart: Path, capsys) -> None:
+def guide_block(word: str, folder: Path) -> str:
+    """The block of the guide's Python that has a word in it, for a twin in a folder."""
     guide = (Path(__file__).parents[2] / "docs" / "registration.md").read_text()
-    lines = guide.split("```python\n")[1].split("```")[0].replace("liver/twin", str(small_quickstart / "twin"))
+    (block,) = (block for block in re.findall(r"```python\n(.*?)```", guide, flags=re.S) if word in block)
+    return block.replace("liver/twin", str(folder / "twin"))
+
+
+def test_the_stream_of_the_guide_runs(small_quickstart: Path, capsys) -> None:
+    cloud = np.load(small_quickstart / "demo" / "cloud.npy")
+    lines = guide_block("answers(", small_quickstart).replace("budget=0.1", "budget=60.0")
+    exec(lines, {"camera": [cloud]})
+    assert capsys.readouterr().out.startswith("accepted")
+
+
+def test_the_five_lines_of_the_guide_run(small_quickstart: Path, capsys) -> None:
+    lines = guide_block("twin.register(", small_quickstart)
     assert len([line for line in lines.splitlines() if line.strip()]) <= 5
     found = {"cloud": np.load(small_quickstart / "demo" / "cloud.npy")}
     exec(lines, found)
