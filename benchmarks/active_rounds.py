@@ -1,11 +1,12 @@
 """Draws that active rounds choose against random ones: error at the 95 % quantile by the number of training draws.
 
-    python benchmarks/active_rounds.py [--loads modal ranges] [--seconds 120] [--ranks 2]
+    python benchmarks/active_rounds.py [--loads modal ranges] [--seconds 120] [--epochs 24] [--ranks 2]
 
 The small beam (304 hexahedra) under the loads of table 4.2 (`modal`) and under loads of all sizes up to 0.4 m
 (`ranges`). Random: 4,096 training draws. Active: 512 random ones, then six rounds of 256 that are chosen from 16 times
-as many candidates each; the rounds' networks are trained for a quarter of --seconds. The same network (reduced, by
-wall time) is trained on the first so many draws of each and judged on the random set's 2,000 held-out draws.
+as many candidates each; the rounds' networks are trained for a quarter of --seconds. The same network (reduced, as
+many steps as --epochs of 4,096 draws are, whatever the machine does beside) is trained on the first so many draws of
+each and judged on the random set's 2,000 held-out draws.
 """
 
 from __future__ import annotations
@@ -81,7 +82,8 @@ _SHARES = {"median": 0.5, "p95": 0.95, "p99": 0.99}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--loads", nargs="+", default=list(LOADS), choices=list(LOADS))
-    parser.add_argument("--seconds", type=float, default=120.0)
+    parser.add_argument("--seconds", type=float, default=120.0, help="four times those of a round's network")
+    parser.add_argument("--epochs", type=int, default=24, help="of 4,096 draws; the steps are the same for fewer")
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
@@ -97,10 +99,11 @@ def main() -> None:
         for kind, count in rows:
             key, data = f"{loads}: {kind}, {count} draws", sets[kind]
             if key not in found:
-                surrogate = train(data, TrainingPlan(Reduced(), seconds=arguments.seconds, samples=count))
+                epochs = arguments.epochs * RANDOM // count
+                surrogate = train(data, TrainingPlan(Reduced(), epochs=epochs, samples=count))
                 counts = surrogate.card["samples"]
                 found[key] = {"draws": count, "accepted": counts["train"], "rejected": counts["rejected"]}
-                found[key] |= {"seconds": arguments.seconds, **judged(surrogate, sets["random"])}
+                found[key] |= {"steps": surrogate.card["training"]["steps"], **judged(surrogate, sets["random"])}
                 write(path.stem, found)
             row, nodal = found[key], found[key]["nodal_error_m"]
             print(
