@@ -50,7 +50,9 @@ class Uncertainty:
         else:
             factor = (points.matrix @ self.factor.reshape(-1, 3 * count)).reshape(-1, 3, count)
             rest = points.matrix @ self.rest
-        return factor @ factor.transpose(0, 2, 1) + np.square(rest)[:, None, None] * np.eye(3)
+        every = factor @ factor.transpose(0, 2, 1)
+        every[:, range(3), range(3)] += np.square(rest)[:, None]
+        return every
 
     @cached_property
     def deviation(self) -> Floats:
@@ -74,6 +76,8 @@ class Uncertainty:
             raise ValueError(f"Uncertainty.margin.confidence: expected a number in (0, 1), got {confidence}.")
         every = self.covariances(points)
         mean = np.trace(every, axis1=1, axis2=2)
+        if not np.isfinite(mean).all():
+            return np.full(len(mean), np.inf)
         squares = np.einsum("pij,pij->p", every, every)
         known = squares > 0.0
         freedom = np.divide(mean**2, squares, out=np.ones_like(mean), where=known)
@@ -120,6 +124,8 @@ def uncertainty(problem: Problem, trial: Trial, posterior: Posterior, unseen: Fl
     if problem.error is not None:
         blocks.append(problem.error.size * problem.error.discrepancy.modes)
         rest = problem.error.size * problem.error.discrepancy.rest
+    if not np.isfinite(posterior.covariance).all():  # of a cloud that tells nothing that could be believed
+        return Uncertainty(np.zeros((3 * len(rest), 1)), np.full(len(rest), np.inf))
     values, vectors = np.linalg.eigh(posterior.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return Uncertainty(np.hstack([np.hstack(blocks) @ root, posterior.scales.force * unseen]), rest)

@@ -56,6 +56,16 @@ def test_the_margin_of_a_normal_law_is_its_quantile(rng: np.random.Generator) ->
         law.margin(confidence=1.0)
 
 
+def test_what_is_not_known_has_no_margin(body: Body, rng: np.random.Generator) -> None:
+    made = registrar(body)
+    found = made.register(cloud_on(body, np.zeros_like(body.points), 100, rng, NOISE))
+    broken = replace(found.posterior, covariance=np.full_like(found.posterior.covariance, np.nan))
+    unknown = replace(found, posterior=broken).uncertainty
+    assert np.isinf(unknown.deviation).all() and np.isinf(unknown.margin()).all()
+    inner = embed(body, np.array([[0.6, 0.1, 0.1]]))
+    assert np.isinf(unknown.margin(inner)).all()
+
+
 def test_what_cannot_move_is_certain(body: Body, rng: np.random.Generator) -> None:
     made = registrar(body)
     truth = made.model.solve(made.forces.forces(FORCE * rng.standard_normal(made.forces.size))).displacement
