@@ -1,6 +1,6 @@
 """Newton's method from a network's prediction (thesis, table 5.3): shares, iterations, factorisations, times, states.
 
-    python benchmarks/hybrid_newton.py [--bodies small large] [--seconds 300] [--only ours]
+    python benchmarks/hybrid_newton.py [--bodies small large liver] [--seconds 300] [--only ours]
 
 Half of the loads are drawn like those that were learned (and are none of them), half are up to twice as large. A
 failure counts at the time it took. Every state found is compared with the one that 20 load steps lead to from rest.
@@ -43,7 +43,8 @@ from softtwin.surrogate.twin import save
 
 Floats = NDArray[np.float64]
 NAME = "hybrid_newton"
-COUNTS = {"small": 1000, "large": 100}
+COUNTS = {"small": 1000, "large": 100, "liver": 100}
+CASES = {"large": "beam", "liver": "liver-tetrahedra"}  # of networks_bodies.py
 FRESH = 1_000_000  # numbers of loads begin here: none of them is in a data set
 RANGES = ("in range", "up to twice")
 STEPS, MOST = 20, 60
@@ -167,14 +168,14 @@ def data_of(body: str, ranks: int) -> DataSet:
     """Equilibria with whole Jacobians to learn from."""
     if body == "small":
         return small_data("modal", {"train": 8192, "validation": 256, "test": 512}, ranks, jacobians=True)
-    return body_data("beam", ranks, jacobians=True)
+    return body_data(CASES[body], ranks, jacobians=True)
 
 
 def network_of(body: str, data: DataSet, seconds: float) -> Surrogate:
     """The reduced network of a body, trained once."""
     folder = RUNS / f"hybrid-{body}-{seconds:g}s"
     if not (folder / "surrogate.json").exists():
-        modes = Reduced().modes if body == "small" else case("beam").modes
+        modes = Reduced().modes if body == "small" else case(CASES[body]).modes
         save(train(data, TrainingPlan(Reduced(modes=modes), seconds=seconds)), folder)
     return load_twin(folder, data.body)
 
@@ -234,7 +235,7 @@ def main() -> None:
     parser.add_argument("--bodies", nargs="+", default=["small", "large"], choices=list(COUNTS))
     parser.add_argument("--seconds", type=float, default=300.0, help="of training")
     parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--count", type=int, help="of loads, in place of 1,000 and 100")
+    parser.add_argument("--count", type=int, help="of loads, in place of 1,000, 100 and 100")
     parser.add_argument("--only", default="", help="ways that have this in their name")
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
