@@ -84,6 +84,17 @@ def test_more_points_and_less_noise_make_it_surer(body: Body) -> None:
     assert sizes[1] < 0.5 * sizes[0]
 
 
+def test_a_dense_cloud_promises_no_more_than_a_thinned_one(body: Body) -> None:
+    """50,000 points of a camera share their noise: they count as the thousand that are used."""
+    made = registrar(body)
+    truth = made.model.solve(made.forces.forces(np.full(made.forces.size, 0.5 * FORCE))).displacement
+    sizes = [
+        made.register(cloud_on(body, truth, count, np.random.default_rng(1), NOISE)).uncertainty.deviation.mean()
+        for count in (1_000, 50_000)
+    ]
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.1)
+
+
 def test_an_unknown_pose_adds_to_it(body: Body, rng: np.random.Generator) -> None:
     prior = PosePrior(Pose.identity(), body.points.mean(axis=0), np.deg2rad(5.0), 0.01)
     plain, posed = registrar(body), registrar(body, prior)
