@@ -219,10 +219,28 @@ def test_what_is_not_seen_pulls_nothing(body: Body, observed: SurfaceDistance, r
     assert np.abs(pull).max() > 0.0
 
 
+def test_thinning_leaves_the_noise_as_it_was(rng) -> None:
+    """A plane, twice as dense on one side: the spread across it is that of all, and both sides count alike."""
+    plane = rng.random((75_000, 3)) * [1.0, 1.0, 0.0]
+    plane = plane[(plane[:, 0] < 0.5) | (rng.random(len(plane)) < 0.5)]
+    noise = 0.01 * rng.standard_normal(len(plane))
+    plane[:, 2] += noise
+    kept = thinned(plane, 1000)
+    assert plane[kept, 2].std() == pytest.approx(0.01, rel=0.07)  # three standard deviations of a thousand
+    assert (plane[kept, 0] < 0.5).mean() == pytest.approx(0.5, abs=0.06)
+
+
+def test_thinning_favours_outliers_no_more_than_twice(rng) -> None:
+    plane = rng.random((20_000, 3)) * [1.0, 1.0, 0.001]
+    wrong = rng.random((2_000, 3))
+    kept = thinned(np.concatenate([plane, wrong]), 1000)
+    assert (kept >= len(plane)).mean() < 0.25
+
+
 def test_thinning_keeps_points_and_spreads_them(rng) -> None:
     cloud = np.concatenate([rng.random((20_000, 3)), 0.01 * rng.random((20_000, 3))])
     kept = thinned(cloud, 1000)
-    assert 600 < len(kept) <= 1000 and len(np.unique(kept)) == len(kept)
+    assert len(kept) == 1000 and len(np.unique(kept)) == len(kept)
     assert (cloud[kept].max(axis=1) < 0.011).mean() < 0.05  # half of the points lie in that corner
     assert np.array_equal(thinned(cloud[:50], 100), np.arange(50))
     with pytest.raises(ValueError, match=r"thinned\.most: expected at least 1"):
