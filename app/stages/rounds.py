@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, write_chosen
 from softtwin.reference.generate import candidate_loads, plan_from_header, solve_block
 from softtwin.surrogate.acquisition import most_telling
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.train import train
-from softtwin.surrogate.twin import load, save
+from softtwin.surrogate.twin import CARD, load, save
 
 from ..config import Config
 from ..workspace import Workspace
@@ -79,20 +78,16 @@ def solve_from_network(path: str, block: int, chosen: int) -> int:
     data = DataSet(path)
     draws, first = data.split_draws("active"), block * data.header["block"]
     network = _network(Path(path), (first - draws.start) // chosen) if first in draws else None
-    if network is None or not network.exists():
+    if network is None or not (network / CARD).exists():
         return solve_block(path, block)
-    return solve_block(path, block, _opened(str(network), data.body))
+    return solve_block(path, block, _opened(str(network), path, (network / CARD).stat().st_mtime_ns))
 
 
 def _network(data: Path, number: int) -> Path:
     return data.parent / "rounds" / str(number + 1)
 
 
-_kept: dict[str, Surrogate] = {}
-
-
-def _opened(folder: str, body: Body) -> Surrogate:
-    if folder not in _kept:
-        _kept.clear()
-        _kept[folder] = load(Path(folder), body)
-    return _kept[folder]
+@lru_cache(maxsize=1)
+def _opened(network: str, data: str, made: int) -> Surrogate:
+    """`made`, the time of its card, tells a network that was trained again in the same place."""
+    return load(Path(network), DataSet(data).body)
