@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,14 @@ from softtwin.meshes.export import Coordinates
 from softtwin.registration.outcome import Outcome
 
 from .conftest import pulled, run, seen_cloud
+
+# Who runs tests in the background may have Ctrl-C ignored, and programs inherit that.
+PROGRAM = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from softtwin.app.cli import main
+main(sys.argv[1:])
+"""
 
 
 @pytest.fixture(scope="module")
@@ -215,9 +224,13 @@ def test_a_folder_is_watched_until_it_is_interrupted(small_quickstart: Path, tmp
     folder, output = tmp_path / "camera", tmp_path / "out"
     folder.mkdir()
     cloud = np.load(small_quickstart / "demo" / "cloud.npy")
-    command = [sys.executable, "-m", "softtwin.app.cli", "register", str(small_quickstart), str(folder), "--watch"]
+    command = [sys.executable, "-c", PROGRAM, "register", str(small_quickstart), str(folder), "--watch"]
     command += ["--budget", "60", "--output", str(output)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process,
+        ExitStack() as ended,
+    ):
+        ended.callback(process.kill)  # whatever fails here, nothing is waited for
         assert process.stdout is not None
         for number in range(2):
             np.savetxt(folder / ".next.xyz", cloud)
@@ -227,8 +240,7 @@ def test_a_folder_is_watched_until_it_is_interrupted(small_quickstart: Path, tmp
         (folder / "cloud_2.xyz").write_text("0 0 0\n1 1")  # a writer that died
         assert "refused" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        process.wait(timeout=120)
-        assert process.returncode == 130
+        assert process.wait(timeout=120) == 130
     record = json.loads((output / RECORD).read_text())
     assert record["counts"] == {"accepted": 2, "doubtful": 0, "refused": 1}
     assert all(row["age_s"] > 0.0 for row in record["frames"])
