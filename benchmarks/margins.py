@@ -129,7 +129,7 @@ def main() -> None:
             if key not in found:
                 with threadpool_limits(1), Twin.open(arguments.folder, engine) as twin:
                     rows = [one(twin, truth, noise, i) for i, truth in enumerate(states)]
-                found[key] = {"summary": summary(rows), "rows": rows}
+                found[key] = {"summary": summary(rows)}
                 write(path.stem, found)
             told = {name: value for name, value in found[key]["summary"].items() if name != "structures"}
             print(key, json.dumps(told), json.dumps(found[key]["summary"]["structures"]), sep="\n  ", flush=True)
