@@ -6,7 +6,8 @@ import glob
 import math
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -225,14 +226,10 @@ def register_files(
     Raises:
         ConfigError, FileError, CloudError, PoseError, TwinError: what cannot be used, and why.
     """
-    home = twins.find_twin(place)
-    inside = coordinates_of(twins.with_options(home.config, dict(options)))
-    outside = replace(inside, unit=unit or inside.unit)
-    clouds = find_clouds(names, outside)
-    positions = None if truth is None else read_truth(truth, len(clouds), home.body, inside)
-    pose = start_pose(start or Start(), inside, outside, say)
-    with home.twin(**options) as twin:
-        camera: Camera = "align" if start and start.align else camera_of(twin, pose)
+    scene = Scene.of(place, options, unit)
+    clouds = find_clouds(names, scene.outside)
+    positions = None if truth is None else read_truth(truth, len(clouds), scene.home.body, scene.inside)
+    with scene.opened(start or Start(), say) as (twin, camera):
         chosen = formats or WRITTEN
         rows = register_clouds(
             twin, clouds, output, camera=camera, truth=positions, formats=chosen, budget=budget, say=say
@@ -240,25 +237,58 @@ def register_files(
     return counts(rows)
 
 
-def start_pose(start: Start, inside: Coordinates, outside: Coordinates, say: Callable[[str], None]) -> Pose | None:
-    """The pose that a person has given; None where none was.
+@dataclass(frozen=True)
+class Scene:
+    """A twin in a folder and the coordinates of its files and of the clouds'.
 
     Args:
-        start: what was given.
+        home: of the twin.
+        options: entries of [registration] that replace the twin's.
         inside: coordinates of the body's files.
         outside: of the clouds' files.
-        say: prints a line.
-
-    Raises:
-        FileError, PoseError: it cannot be read.
     """
-    if start.matrix is not None:
-        return camera_from_matrix(start.matrix, outside)
-    if start.landmarks is not None:
-        fit = camera_from_landmarks(*start.landmarks, inside, outside)
-        say(describe_landmarks(fit))
-        return fit.pose
-    return None
+
+    home: twins.Home
+    options: Mapping[str, Any]
+    inside: Coordinates
+    outside: Coordinates
+
+    @classmethod
+    def of(cls, place: Path, options: Mapping[str, Any], unit: Unit | None) -> Scene:
+        """The scene of a place; see `find_twin`.
+
+        Args:
+            place: the twin.
+            options: as above.
+            unit: of the clouds; that of the twin's files if not given.
+
+        Raises:
+            ConfigError: there is no twin, or an option cannot be.
+        """
+        home = twins.find_twin(place)
+        inside = coordinates_of(twins.with_options(home.config, dict(options)))
+        return cls(home, options, inside, replace(inside, unit=unit or inside.unit))
+
+    @contextmanager
+    def opened(self, start: Start, say: Callable[[str], None]) -> Iterator[tuple[Twin, Camera]]:
+        """The twin, and where the camera stands.
+
+        Args:
+            start: what a person has given.
+            say: prints a line.
+
+        Raises:
+            ConfigError, FileError, PoseError, TwinError: what cannot be used, and why.
+        """
+        pose = None
+        if start.matrix is not None:
+            pose = camera_from_matrix(start.matrix, self.outside)
+        if start.landmarks is not None:
+            fit = camera_from_landmarks(*start.landmarks, self.inside, self.outside)
+            say(describe_landmarks(fit))
+            pose = fit.pose
+        with self.home.twin(**self.options) as twin:
+            yield twin, "align" if start.align else camera_of(twin, pose)
 
 
 def camera_of(twin: Twin, pose: Pose | None) -> Pose | PosePrior | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +21,15 @@ from .record import Recorder, counts, describe
 from .register import (
     CLOUDS,
     CloudFile,
+    Scene,
     Start,
     by_numbers,
-    camera_of,
     check_any,
     check_budget,
     name_of,
     registered,
-    start_pose,
 )
-from .twin import Camera, Frame, Sequence, Twin, coordinates_of, find_twin, with_options
+from .twin import Camera, Frame, Sequence, Twin
 
 Cloud = CloudFile | ArrayLike
 Clock = Callable[[], float]
@@ -315,16 +314,12 @@ def watch_folder(
     check_budget(budget)
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"--watch: expected a folder, got the file {folder}.")
-    home = find_twin(place)
-    inside = coordinates_of(with_options(home.config, dict(options)))
-    outside = replace(inside, unit=unit or inside.unit)
+    scene = Scene.of(place, options, unit)
     try:
-        source = WatchedFolder(folder, lambda path: CloudFile(path, outside), idle=idle)
+        source = WatchedFolder(folder, lambda path: CloudFile(path, scene.outside), idle=idle)
     except ValueError as error:
         raise ConfigError(f"--idle: {error}") from None
-    pose = start_pose(start or Start(), inside, outside, say)
-    with home.twin(**options) as twin:
-        camera: Camera = "align" if start and start.align else camera_of(twin, pose)
+    with scene.opened(start or Start(), say) as (twin, camera):
         twin.registrar()  # prepared before the first cloud is waited for
         chosen = formats or WRITTEN
         rows = register_live(twin, fed(source), output, camera=camera, formats=chosen, budget=budget, say=say)

@@ -100,11 +100,16 @@ def costs(certifier: Certifier, loads: list[Floats], problem: Problem) -> dict[s
 
 
 def newton_step(problem: Problem, load: Floats, displacement: Floats) -> tuple[float, int | None]:
-    """Mean nodal length of Newton's step from a prediction, metres, and the negative pivots there."""
+    """Mean nodal length of Newton's step from a prediction, metres, and the negative pivots there.
+
+    Infinite, and None, where the prediction turns a cell inside out.
+    """
     start = displacement.copy()
     start[problem.body.fixed] = 0.0
     gap = problem.internal_forces(start) - load
     gap[problem.body.fixed] = 0.0
+    if not np.isfinite(gap).all():
+        return np.inf, None
     step = problem.apply_inverse(gap.ravel(), start).reshape(-1, 3)
     return float(np.linalg.norm(step, axis=1).mean()), problem.negative_pivots(start)
 

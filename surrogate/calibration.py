@@ -241,8 +241,9 @@ def quantile(scores: Floats, confidence: float) -> float | None:
 
 
 def _limit(values: list[float], share: float) -> float:
-    """What so large a share of the values stays below; those that are not finite lie above all."""
+    """What at least so large a share of further values stays below on average; those not finite lie above all."""
     ordered = np.sort(np.where(np.isfinite(values), values, np.inf))
-    found = float(ordered[min(len(ordered) - 1, int(np.ceil(share * len(ordered))) - 1)])
+    kept = quantile(ordered, share)
+    found = float(ordered[-1]) if kept is None else kept
     finite = ordered[np.isfinite(ordered)]
     return found if np.isfinite(found) else float(finite[-1]) if len(finite) else 0.0

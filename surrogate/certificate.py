@@ -81,8 +81,9 @@ class Certifier:
         place = int(np.searchsorted(known["edges"], signs.size, side="right"))
         bounds = {}
         for error in ERRORS:
-            factor, size = known["quantiles"][error][place], np.exp(signs.row @ known["powers"][error])
-            bounds[error] = np.inf if factor is None or not np.isfinite(signs.residual) else float(factor * size)
+            factor = known["quantiles"][error][place]
+            is_known = factor is not None and np.isfinite(signs.residual)
+            bounds[error] = float(factor * np.exp(signs.row @ known["powers"][error])) if is_known else np.inf
         return Certificate(**bounds, confidence=known["confidence"], signs=signs, reasons=tuple(self._reasons(signs)))
 
     def _reasons(self, signs: Signs) -> list[str]:

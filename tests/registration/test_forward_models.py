@@ -39,15 +39,16 @@ def data(tmp_path_factory: pytest.TempPathFactory, hexahedral_beam: Body) -> Dat
     return made
 
 
+EPOCHS = 120  # that the networks have learned what is not linear
 _NETWORKS = {"reduced": Reduced(modes=16, width=32), "mlp": Perceptron()}
 
 
 @pytest.fixture(scope="module", params=ALL)
 def model(request: pytest.FixtureRequest, data: DataSet) -> Iterator[ForwardModel]:
     if request.param in _NETWORKS:
-        yield train(data, TrainingPlan(_NETWORKS[request.param], epochs=40))
+        yield train(data, TrainingPlan(_NETWORKS[request.param], epochs=EPOCHS))
         return
-    predictor = train(data, TrainingPlan(_NETWORKS["reduced"], epochs=40)) if request.param == "hybrid" else None
+    predictor = train(data, TrainingPlan(_NETWORKS["reduced"], epochs=EPOCHS)) if request.param == "hybrid" else None
     with Problem(data.body, PLAN.build_material(), NewtonOptions(tolerance=1e-11)) as problem:
         yield ReferenceModel(problem, predictor=predictor)
 
@@ -130,7 +131,7 @@ def test_states_keep_what_they_are(
     again = (first.displacement, first.push(changes), first.pull(cotangent))
     for was, now, elsewhere in zip(before, again, apart, strict=True):
         np.testing.assert_allclose(now, was, rtol=0.0, atol=1e-12 * np.abs(was).max())
-        assert np.abs(elsewhere - was).max() > 1e-5 * np.abs(was).max()  # ten million times what may change
+        assert np.abs(elsewhere - was).max() > 1e-3 * np.abs(was).max()
 
 
 def test_pivots_are_counted_or_not_known(model: ForwardModel, load: np.ndarray) -> None:

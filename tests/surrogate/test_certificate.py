@@ -90,7 +90,7 @@ def test_a_higher_confidence_is_a_wider_bound(bare: Surrogate, data: DataSet, su
 def test_loads_far_beyond_those_learned_are_set_aside_and_not_refused(surrogate: Surrogate, data: DataSet) -> None:
     certifier, tops = Certifier(surrogate), [ramp_loads(data, PLAN, 10**6 + i)[0] for i in range(64)]
     near, far = ([certifier.certify(scale * top) for top in tops] for scale in (0.9, 3.0))
-    assert sum(each.is_inside for each in near) > 0.8 * len(near)  # one in a hundred for each sign lies out by design
+    assert sum(each.is_inside for each in near) >= 60
     assert not any(each.is_inside for each in far)
     assert "times as far out as the farthest" in " ".join(reason for each in far for reason in each.reasons)
     assert all(np.isfinite(each.mean) for each in near)
