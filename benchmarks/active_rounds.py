@@ -12,12 +12,11 @@ each and judged on the random set's 2,000 held-out draws.
 from __future__ import annotations
 
 import argparse
-import json
 from typing import Any
 
 import numpy as np
 from networks import AMPLITUDES, RUNS
-from record import RESULTS, write
+from record import recorded, write
 
 from softtwin.app.chain import prepare
 from softtwin.app.config import Config
@@ -87,8 +86,7 @@ def main() -> None:
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
-    path = RESULTS / f"{arguments.name}.json"
-    found = json.loads(path.read_text())["figures"] if path.exists() else {}
+    found = recorded(arguments.name)
     for loads in arguments.loads:
         sets = {
             kind: data_of(loads, kind == "active", arguments.seconds, arguments.ranks) for kind in ("random", "active")
@@ -104,7 +102,7 @@ def main() -> None:
                 counts = surrogate.card["samples"]
                 found[key] = {"draws": count, "accepted": counts["train"], "rejected": counts["rejected"]}
                 found[key] |= {"steps": surrogate.card["training"]["steps"], **judged(surrogate, sets["random"])}
-                write(path.stem, found)
+                write(arguments.name, found)
             row, nodal = found[key], found[key]["nodal_error_m"]
             print(
                 f"{key:30} {row['accepted']} accepted; mean {1e3 * nodal['mean']:.4f}, 95 % {1e3 * nodal['p95']:.4f}, "

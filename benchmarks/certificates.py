@@ -21,7 +21,7 @@ from networks import RUNS
 from networks import data_of as small_data
 from networks_bodies import case, data_of
 from numpy.typing import NDArray
-from record import RESULTS, write
+from record import recorded, write
 from scipy.stats import spearmanr
 from threadpoolctl import threadpool_limits
 
@@ -144,8 +144,7 @@ def main() -> None:
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
-    path = RESULTS / f"{arguments.name}.json"
-    found = json.loads(path.read_text())["figures"] if path.exists() else {}
+    found = recorded(arguments.name)
     for body in arguments.bodies:
         data, plan = data_of(body, arguments.ranks, body != "modal"), case(body).plan
         surrogate = network_of(body, data, arguments.seconds, arguments.ranks)
@@ -162,7 +161,7 @@ def main() -> None:
                 "ms": costs(certifier, tops, problem),
             }
         print(json.dumps({name: value for name, value in found[body].items() if name != "held_out"}, indent=1))
-        write(path.stem, found)
+        write(arguments.name, found)
 
 
 if __name__ == "__main__":

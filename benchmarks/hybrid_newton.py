@@ -16,7 +16,6 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from networks import data_of as small_data
 from networks_bodies import case
 from networks_bodies import data_of as body_data
 from numpy.typing import NDArray
-from record import RESULTS, write
+from record import recorded, write
 from threadpoolctl import threadpool_limits
 
 from softtwin.reference.data.dataset import DataSet
@@ -239,8 +238,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="ways that have this in their name")
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
-    path = Path(RESULTS / f"{arguments.name}.json")
-    found = json.loads(path.read_text())["figures"] if path.exists() else {}
+    found = recorded(arguments.name)
     for body in arguments.bodies:
         data = data_of(body, arguments.ranks)
         plan = plan_from_header(data.header)
@@ -269,7 +267,7 @@ def main() -> None:
                     key = f"{body}, {name}: {label}"
                     found[key] = figures_of([each[label] for each in taken], truth[name])
                     print(key, found[key], flush=True)
-                write(path.stem, found)
+                write(arguments.name, found)
 
 
 if __name__ == "__main__":

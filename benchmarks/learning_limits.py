@@ -9,11 +9,10 @@ settings after equal wall time. The data are those of networks_bodies.py.
 from __future__ import annotations
 
 import argparse
-import json
 from typing import Any
 
 from networks_bodies import data_of
-from record import RESULTS, write
+from record import recorded, write
 
 from softtwin.meshes.metrics import relative_error
 from softtwin.reference.data.dataset import DataSet
@@ -49,8 +48,7 @@ def main() -> None:
     parser.add_argument("--ranks", type=int, default=2)
     arguments = parser.parse_args()
     name = f"learning_limits_{arguments.body}"
-    path = RESULTS / f"{name}.json"
-    found: dict[str, Any] = json.loads(path.read_text())["figures"] if path.exists() else {}
+    found = recorded(name)
     data = data_of(arguments.body, arguments.ranks)
     found["floor"] = {str(modes): floor(data, modes) for modes in (64, 128, 192)}
     for modes, values in found["floor"].items():

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from record import RESULTS, write
+from record import recorded, write
 from threadpoolctl import threadpool_limits
 
 from softtwin.app.quickstart import CAMERA, POINTS
@@ -119,8 +119,7 @@ def main() -> None:
     parser.add_argument("--engines", nargs="+", default=["surrogate", "hybrid"])
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
-    path = RESULTS / f"{arguments.name}.json"
-    found = json.loads(path.read_text())["figures"] if path.exists() else {}
+    found = recorded(arguments.name)
     data = DataSet(arguments.folder / "data.zarr")
     for label, (noise, poisson_ratio) in ROWS.items():
         states = truths(data, arguments.loads, poisson_ratio)
@@ -130,7 +129,7 @@ def main() -> None:
                 with threadpool_limits(1), Twin.open(arguments.folder, engine) as twin:
                     rows = [one(twin, truth, noise, i) for i, truth in enumerate(states)]
                 found[key] = {"summary": summary(rows)}
-                write(path.stem, found)
+                write(arguments.name, found)
             told = {name: value for name, value in found[key]["summary"].items() if name != "structures"}
             print(key, json.dumps(told), json.dumps(found[key]["summary"]["structures"]), sep="\n  ", flush=True)
 

@@ -11,7 +11,6 @@ written as it is finished; the same command goes on with the rows that are missi
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import time
 from collections.abc import Iterable, Iterator
@@ -23,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from record import RESULTS, write
+from record import recorded, write
 
 from softtwin.app.chain import prepare
 from softtwin.app.config import Config
@@ -287,8 +286,7 @@ def main() -> None:
     if not arguments.own_alone and not arguments.data:
         count = arguments.train if "4.1" in arguments.tables else 16
         data["random"] = data_of("random", {"train": count, **held_out}, ranks, seed)
-    path = RESULTS / f"{arguments.name}.json"
-    found = json.loads(path.read_text())["figures"] if path.exists() else {}
+    found = recorded(arguments.name)
     with reference(data["modal"]) as problem:
         wanted = list(rows(arguments.tables, arguments.train, arguments.seconds))
         if "thesis" in arguments.tables:
@@ -301,7 +299,7 @@ def main() -> None:
             if key not in found:
                 learned = data_of("modal", counts, ranks, seed, True) if row.jacobians else None
                 found[key] = run(row, data, problem, learned)
-                write(path.stem, found)
+                write(arguments.name, found)
             show(key, found[key])
 
 

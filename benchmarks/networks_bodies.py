@@ -10,7 +10,6 @@ one training, judged on 100 held-out samples, and is written as it is finished; 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
@@ -22,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from networks import AMPLITUDES, RUNS, Row, run, show
 from numpy.typing import NDArray
-from record import LIVER, RESULTS, write
+from record import LIVER, recorded, write
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_mesh
@@ -191,8 +190,7 @@ def main() -> None:
     if arguments.generate or arguments.differentiate:
         (make if arguments.generate else differentiate_all)(arguments.generate or arguments.differentiate)
         return
-    path = RESULTS / f"{arguments.name}.json"
-    found = json.loads(path.read_text())["figures"] if path.exists() else {}
+    found = recorded(arguments.name)
     for name in arguments.bodies:
         data = data_of(name, arguments.ranks)
         with Problem(data.body, data.material, case(name).plan.newton) as problem:
@@ -202,7 +200,7 @@ def main() -> None:
                 if row.key not in found:
                     learned = data_of(name, arguments.ranks, True) if row.jacobians else None
                     found[row.key] = run(row, {name: data}, problem, learned)
-                    write(path.stem, found)
+                    write(arguments.name, found)
                 show(row.key, found[row.key])
 
 

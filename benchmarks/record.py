@@ -18,6 +18,13 @@ RESULTS = Path(__file__).parent / "results"
 LIVER = Path(__file__).parents[2] / "shared" / "data" / "liver"
 
 
+def recorded(name: str) -> dict[str, Any]:
+    """Figures that were written under a name; none where nothing was."""
+    path = RESULTS / f"{name}.json"
+    found: dict[str, Any] = json.loads(path.read_text())["figures"] if path.exists() else {}
+    return found
+
+
 def machine() -> dict[str, Any]:
     """Processor, cores and load of this machine, and the versions that figures depend on."""
     info = Path("/proc/cpuinfo")

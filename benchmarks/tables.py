@@ -5,11 +5,10 @@ python benchmarks/tables.py
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from liver import SEQUENCES
-from record import RESULTS
+from record import recorded
 from robustness import ROWS
 
 ASKED = {
@@ -28,12 +27,6 @@ ASKED = {
 }
 
 
-def figures(name: str) -> dict[str, Any]:
-    path = RESULTS / f"{name}.json"
-    found: dict[str, Any] = json.loads(path.read_text())["figures"] if path.exists() else {}
-    return found
-
-
 def row(*cells: object) -> None:
     print("| " + " | ".join(map(str, cells)) + " |")
 
@@ -46,7 +39,7 @@ def head(*cells: str) -> None:
 
 def robustness(model: str) -> None:
     """Degraded clouds: errors, calibration, time and verdicts by row and start."""
-    found = figures(f"robustness_{model}")
+    found = recorded(f"robustness_{model}")
     head(
         model, "start", "TRE mm (95 %)", "force %", "z rms", "accepted %", "median s (longest)", "asked: TRE; force; z"
     )
@@ -75,7 +68,7 @@ def robustness(model: str) -> None:
 
 def sequences(name: str) -> None:
     """Whole sequences: frames 1-49, and the cold frame 0."""
-    found = figures(name)["sequences"]
+    found = recorded(name)["sequences"]
     each = [found[s]["summary"] for s in SEQUENCES]
     head(name, *SEQUENCES)
     for label, key, scale, form in (
@@ -100,7 +93,7 @@ def with_deviation(spread: dict[str, float], scale: float, form: str) -> str:
 
 def networks(name: str) -> None:
     """Networks: held-out errors, means +- deviations over the samples, and how sound the predictions are."""
-    found = figures(name)
+    found = recorded(name)
     if not found:
         return
     errors = ("e mm", "largest mm", "norm / nodes um", "relative % (95 %)", "SNR dB", "cosine", "Jacobian %")
@@ -129,7 +122,7 @@ def networks(name: str) -> None:
 
 def hybrid() -> None:
     """Newton's method from a network's prediction: means are over all loads, failures at the time they took."""
-    found = figures("hybrid_newton")
+    found = recorded("hybrid_newton")
     if not found:
         return
     head("hybrid_newton", "same state", "prediction picked", "iterations; factorisations", "ms: median; mean; 95 %")
@@ -150,7 +143,7 @@ def _kept_inside(outside: dict[str, Any]) -> str:
 
 def certificates() -> None:
     """Bounds on errors, by range of size from the smallest to the largest."""
-    found = figures("certificates")
+    found = recorded("certificates")
     if not found:
         return
     ranges = "; by size"

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from networks_bodies import liver, tetrahedral_liver
-from record import RESULTS, write
+from record import recorded, write
 
 from softtwin.reference.data.dataset import SPLITS, DataSet
 from softtwin.reference.data.samplers import LoadPlan
@@ -85,8 +85,7 @@ def main() -> None:
     if arguments.make:
         make(arguments.make, arguments.draws, arguments.folder)
         return
-    path = RESULTS / f"{NAME}.json"
-    found = json.loads(path.read_text())["figures"] if path.exists() else {}
+    found = recorded(NAME)
     for name in arguments.bodies:
         for ranks in arguments.ranks:
             key = f"{name}, {ranks} {'rank' if ranks == 1 else 'ranks'}"

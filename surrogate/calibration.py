@@ -86,7 +86,8 @@ def calibrate(
     edges = np.quantile(sizes, np.linspace(0.0, 1.0, max(1, min(_RANGES, len(held) // _A_RANGE)) + 1))[1:-1]
     places = np.searchsorted(edges, sizes, side="right")
     rows = np.stack([signs.row for signs in shown])
-    scores = {error: errors[error] / np.exp(rows @ powers[error]) for error in ERRORS}
+    with np.errstate(over="ignore"):  # a prediction inside out has no bound, and keeps that
+        scores = {error: errors[error] / np.exp(rows @ powers[error]) for error in ERRORS}
     entry = {
         "confidence": confidence,
         "samples": len(held),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -101,6 +102,18 @@ def test_a_prediction_inside_out_has_no_bound(surrogate: Surrogate, data: DataSe
     found = Certifier(surrogate).certify(loads(data, 1)[0], wrong)
     assert found.mean == found.largest == np.inf and not found.is_inside
     assert "inside out" in found.reasons[0]
+
+
+def test_a_network_that_turns_cells_inside_out_is_calibrated_without_a_bound_for_these(
+    bare: Surrogate, data: DataSet
+) -> None:
+    wild = Surrogate(bare.body, bare.maps, copy.deepcopy(bare.network), bare.card)
+    for weights in wild.network.parameters():
+        weights.mul_(20.0)
+    certifier = Certifier(calibrate(wild, data))
+    given = [certifier.certify(load) for load in loads(data, 32)]
+    lost = [each for each in given if not np.isfinite(each.signs.residual)]
+    assert lost and all(each.mean == np.inf and not each.is_inside for each in lost)
 
 
 def test_no_load_is_certain(surrogate: Surrogate, small: Body) -> None:
