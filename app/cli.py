@@ -283,7 +283,7 @@ def register(
             say=click.echo,
         )  # fmt: skip
     said = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items() if count)
-    click.echo(f"{said}; written to {output}\n{NOTICE}")
+    click.echo(f"{said or 'no frame'}; written to {output}\n{NOTICE}")
     if strict and verdicts["doubtful"] + verdicts["refused"]:
         sys.exit(3)
 

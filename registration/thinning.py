@@ -11,7 +11,7 @@ Ints = NDArray[np.int64]
 _LOOKED_AT = 4  # times as many points as are wanted, drawn evenly, are looked at
 _COUNTED = 1_000  # of them, among which the density is counted
 _NEAR = 0.05  # of the cloud's extent: far more than noise, so that points in front of the surface count as those on it
-_THIN = 0.5  # of the lower quartile of the density: thinner places are no more favoured, outliers least of all
+_THIN = 0.5  # of the lower quartile of the density: thinner places are favoured the less, outliers least of all
 
 
 def thinned(cloud: Floats, most: int) -> Ints:
@@ -19,7 +19,8 @@ def thinned(cloud: Floats, most: int) -> Ints:
 
     Points are drawn with a probability that falls with the density about them, systematically in space (after Stevens
     and Olsen 2004). They are neither averaged nor chosen by where they lie across the surface, so that their noise
-    stays what it was: one point a voxel would favour those that noise has thrown farthest.
+    stays what it was: one point a voxel would favour those that noise has thrown farthest. Where hardly any other point
+    is near, an outlier is likelier than a part of the surface.
 
     Args:
         cloud: points, (p, 3), metres.
@@ -36,8 +37,9 @@ def thinned(cloud: Floats, most: int) -> Ints:
     some = chance.permutation(len(cloud))[: _LOOKED_AT * most]
     seen = cloud[some]
     near = _NEAR * float(np.linalg.norm(np.ptp(seen, axis=0)))
-    counts = cKDTree(seen[:_COUNTED]).query_ball_point(seen, near, return_length=True)
-    shares = 1.0 / np.maximum(counts, _THIN * np.quantile(counts, 0.25))
+    counts = 1 + cKDTree(seen[:_COUNTED]).query_ball_point(seen, near, return_length=True)
+    least = _THIN * np.quantile(counts, 0.25)
+    shares = np.minimum(counts / least, least / counts)
     # Every so-manieth share in an order in which neighbours follow each other: as likely, and evenly spread.
     order = cKDTree(seen).indices
     ends = np.cumsum(shares[order])

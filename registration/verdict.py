@@ -107,7 +107,10 @@ def judge(problem: Problem, found: Found, state: State, expected: Expectations) 
     if not findings:
         return Judgement(Verdict.ACCEPTED)
     findings.sort(key=lambda finding: finding[0] is not Verdict.REFUSED)  # the gravest reasons first
-    return Judgement(findings[0][0], tuple(reason for _, reason in findings))
+    worst = findings[0][0]
+    if found.outcome is Outcome.OUT_OF_TIME:  # whatever else is wrong may come of it
+        findings.sort(key=lambda finding: finding[1] != _of_the_search(found)[0][1])
+    return Judgement(worst, tuple(reason for _, reason in findings))
 
 
 def _of_the_search(found: Found) -> list[_Finding]:

@@ -230,11 +230,12 @@ def test_thinning_leaves_the_noise_as_it_was(rng) -> None:
     assert (plane[kept, 0] < 0.5).mean() == pytest.approx(0.5, abs=0.06)
 
 
-def test_thinning_favours_outliers_no_more_than_twice(rng) -> None:
+def test_thinning_leaves_outliers_out_rather_than_in(rng) -> None:
+    """One point in eleven lies anywhere: of those kept, fewer do."""
     plane = rng.random((20_000, 3)) * [1.0, 1.0, 0.001]
     wrong = rng.random((2_000, 3))
     kept = thinned(np.concatenate([plane, wrong]), 1000)
-    assert (kept >= len(plane)).mean() < 0.25
+    assert (kept >= len(plane)).mean() < 0.7 / 11.0
 
 
 def test_thinning_keeps_points_and_spreads_them(rng) -> None:
