@@ -269,7 +269,7 @@ def register(
     if idle is not None and not watch:
         raise ConfigError("--idle: expected --watch beside it.")
     if watch:
-        from .streams import watch_folder
+        from .live import watch_folder
 
         if len(clouds) != 1 or truth is not None:
             raise ConfigError("--watch: expected one folder and no --truth.")

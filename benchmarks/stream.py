@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from record import write
 from threadpoolctl import threadpool_limits
 
+from softtwin.app.live import answers
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS
-from softtwin.app.streams import answers, fed
+from softtwin.app.streams import fed
 from softtwin.app.twin import Sequence, Twin
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.metrics import nodal_distances

@@ -176,11 +176,9 @@ class Problem:
     def _by_pose(self, trial: Trial) -> Floats:
         """A point of the cloud stays where it is: in the body's coordinates it moves against the pose."""
         assert self.pose is not None and trial.pose is not None
-        twist = self.pose.deviations * trial.coefficients[self.pose_part]
-        centre = self.pose.mean.apply(self.pose.centre[None])[0]
-        in_camera = self.pose.mean.moved_jacobian(trial.cloud, twist, centre).reshape(-1, 3, 6)
+        in_camera = self.pose.jacobian(trial.coefficients[self.pose_part], trial.cloud)
         along = trial.match.directions @ trial.pose.rotation.T  # directions in the camera's axes
-        return np.einsum("pi,pij->pj", along, in_camera) * self.pose.deviations
+        return np.einsum("pi,pij->pj", along, in_camera)
 
     def moved(self, trial: Trial, change: Floats) -> Floats:
         """How far some hundred nodes, spread over those observed, move for a change, first order, (m,), metres."""

@@ -115,11 +115,9 @@ def uncertainty(problem: Problem, trial: Trial, posterior: Posterior, unseen: Fl
     state = trial.state.full
     blocks = [state.push(problem.forces.basis)]
     if problem.pose is not None and trial.pose is not None:
-        twist = problem.pose.deviations * trial.coefficients[problem.pose_part]
-        centre = problem.pose.mean.apply(problem.pose.centre[None])[0]
         places = problem.observed.body.points + state.displacement + problem.correction(trial)
-        in_camera = problem.pose.mean.moved_jacobian(places, twist, centre).reshape(-1, 3, 6)
-        blocks.append(np.einsum("ji,njk->nik", trial.pose.rotation, in_camera).reshape(-1, 6) * problem.pose.deviations)
+        in_camera = problem.pose.jacobian(trial.coefficients[problem.pose_part], places)
+        blocks.append(np.einsum("ji,njk->nik", trial.pose.rotation, in_camera).reshape(-1, 6))
     rest = np.zeros(len(problem.observed.body.points))
     if problem.error is not None:
         blocks.append(problem.error.size * problem.error.discrepancy.modes)

@@ -261,7 +261,22 @@ class PosePrior:
 
     def pose(self, coefficients: Floats) -> Pose:
         """The pose for coefficients of unit variance, (6,)."""
-        return self.mean.moved(self.deviations * coefficients, self.mean.apply(self.centre[None])[0])
+        return self.mean.moved(self.deviations * coefficients, self._pivot)
+
+    def jacobian(self, coefficients: Floats, points: Floats) -> Floats:
+        """Derivative of where the camera sees points by the coefficients, (p, 3, 6), metres, on the camera's axes.
+
+        Args:
+            coefficients: of unit variance, (6,).
+            points: in the body's coordinates, (p, 3), metres.
+        """
+        moved = self.mean.moved_jacobian(points, self.deviations * coefficients, self._pivot)
+        return moved.reshape(-1, 3, 6) * self.deviations
+
+    @property
+    def _pivot(self) -> Floats:
+        """The centre of the turn where the expected pose puts it, (3,)."""
+        return self.mean.apply(self.centre[None])[0]
 
 
 @dataclass(frozen=True, eq=False)

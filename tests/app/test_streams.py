@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 
 from softtwin.app.config import ConfigError
+from softtwin.app.live import answers, keeping_up, register_live
 from softtwin.app.record import RECORD
 from softtwin.app.register import CloudFile
-from softtwin.app.streams import Mailbox, WatchedFolder, answers, fed, keeping_up, register_live
+from softtwin.app.streams import Mailbox, WatchedFolder, fed
 from softtwin.app.twin import Sequence, Twin
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
