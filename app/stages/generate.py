@@ -50,7 +50,7 @@ def generate_stage(
     from softtwin.reference.generate import generate, plan_from_header
 
     comm, begin = MPI.COMM_WORLD, time.perf_counter()
-    asked = on_first(comm, lambda: _read(configuration))
+    asked = on_first(comm, lambda: _read(configuration, part))
     if asked is None:
         generate(None, None, None, comm, part=part)
         while comm.bcast(None, root=0) is not None:
@@ -60,9 +60,8 @@ def generate_stage(
             on_first(comm, lambda: None)
             differentiate(None, None, comm)
         return None
-    space, body = asked
+    space, body, active = asked
     plan = plan_from_header({"plan": plan_entries(space.config)})
-    active = _active_rounds(space.config) if part is None else None
     task = active.solver(space.config) if active else None
     data = generate(space.data, body, plan, comm, redo, again, part, task)
     assert data is not None
@@ -126,6 +125,7 @@ def describe_data(data: DataSet) -> str:
     )
 
 
-def _read(configuration: Path) -> tuple[Workspace, Body]:
+def _read(configuration: Path, part: Part | None) -> tuple[Workspace, Body, Any]:
+    """The workspace, its body, and what active rounds are made with."""
     space = open_workspace(configuration)
-    return space, current_body(space)
+    return space, current_body(space), _active_rounds(space.config) if part is None else None

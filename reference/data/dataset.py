@@ -240,7 +240,12 @@ class DataSet:
     @property
     def chosen(self) -> Ints:
         """Numbers of the candidate ramps that the active draws are, in their order; -1 for those not chosen yet."""
-        return np.asarray(self._root["active/ramps"][:]) if "active" in self._root else np.empty(0, dtype=np.int64)
+        if "active" not in self._root:
+            return np.empty(0, dtype=np.int64)
+        try:
+            return np.asarray(self._root["active/ramps"][:])
+        except Exception as error:  # a damaged chunk fails in whichever codec reads it
+            raise DataSetError(f"DataSet: active/ramps in {self.path} cannot be read: {_BEYOND_REPAIR}") from error
 
     def rows(self, draws: range) -> dict[str, NDArray[Any]]:
         """Everything that is stored of draws, rejected ones too, by name; not checked (see `check_complete`)."""

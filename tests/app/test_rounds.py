@@ -242,6 +242,21 @@ def test_rounds_without_torch_say_what_is_missing(copied: Workspace, monkeypatch
         generate_stage(copied.root / "organ.toml")
 
 
+@pytest.mark.mpi
+def test_all_ranks_end_where_torch_is_missing(copied: Workspace, mpi_environment: dict[str, str]) -> None:
+    program = "import sys; sys.modules['softtwin.surrogate.train'] = None; from softtwin.app.cli import main; main()"
+    command = ["mpirun", "-n", "2", sys.executable, "-c", program, "generate", str(copied.root / "organ.toml")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=mpi_environment)
+    assert done.returncode != 0 and (done.stdout + done.stderr).count("samples.rounds: expected torch") == 1
+
+
+def test_a_damaged_choice_is_told(copied: Workspace) -> None:
+    (chunk,) = [path for path in (copied.data / "active" / "ramps" / "c").rglob("*") if path.is_file()]
+    chunk.write_bytes(b"no zarr")
+    with pytest.raises(DataSetError, match=r"active/ramps in .* cannot be read"):
+        _ = DataSet(copied.data).chosen
+
+
 def test_other_rounds_are_another_data_set(copied: Workspace, capsys: pytest.CaptureFixture[str]) -> None:
     path = copied.root / "organ.toml"
     path.write_text(path.read_text().replace("rounds = 2 ", "rounds = 3 "))
