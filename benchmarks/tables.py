@@ -169,6 +169,61 @@ def certificates() -> None:
         )
 
 
+def margins() -> None:
+    """How often margins cover the truth, and how well the predicted error tells the true one."""
+    found = recorded("margins")
+    if not found:
+        return
+    covered = "nodes covered by 50 / 90 / 95 % margins"
+    head("margins", "error; predicted mm", "r", covered, "tumour", "its 95 % margin mm", "median s")
+    for key, f in found.items():
+        told = f["summary"]
+        tumour = told["structures"]["tumour"]
+        row(
+            key,
+            f"{told['error_mm']:.2f}; {told['predicted_mm']:.2f}",
+            f"{told['correlation']:.2f}",
+            " / ".join(f"{100 * share:.0f}" for share in told["nodes_covered"].values()),
+            " / ".join(f"{100 * share:.0f}" for share in tumour["covered"].values()),
+            f"{tumour['margin95_mm']:.2f}",
+            f"{told['median_seconds']:.2f}",
+        )
+
+
+def active_rounds() -> None:
+    """Draws that active rounds choose against random ones."""
+    found = recorded("active_rounds")
+    if not found:
+        return
+    head("active_rounds", "mean; 95 %; 99 % mm", "relative %, median (95 %)")
+    for key, f in found.items():
+        nodal, relative = f["nodal_error_m"], f["relative_error"]
+        row(
+            key,
+            "; ".join(f"{1e3 * nodal[name]:.3f}" for name in ("mean", "p95", "p99")),
+            f"{100 * relative['median']:.3f} ({100 * relative['p95']:.2f})",
+        )
+
+
+def throughput() -> None:
+    """Equilibria a second by ranks."""
+    found = recorded("throughput")
+    if not found:
+        return
+    head("throughput", "draws a second", "efficiency", "20,480 at that rate, h", "before the first draw, s", "rejected")
+    for key, f in found.items():
+        body, ranks = key.split(",")[0], int(key.split(",")[1].split()[0])
+        alone = found[f"{body}, 1 rank"]["draws_a_second"]
+        row(
+            f"{key}, {f['draws']:,} draws",
+            f"{f['draws_a_second']:.2f}",
+            f"{f['draws_a_second'] / alone / ranks:.2f}",
+            f"{f['hours_for_20480']:.2f}",
+            f"{f['prepare_s']:.0f}",
+            sum(f["rejected"].values()),
+        )
+
+
 def main() -> None:
     for model in ("surrogate", "reference"):
         robustness(model)
@@ -180,6 +235,9 @@ def main() -> None:
     networks("networks_bodies")
     hybrid()
     certificates()
+    margins()
+    active_rounds()
+    throughput()
 
 
 if __name__ == "__main__":
