@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 from scipy.sparse import csr_array
-from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
-from vtkmodules.vtkCommonCore import vtkPoints
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
-from vtkmodules.vtkFiltersGeneral import vtkDistancePolyDataFilter
+from vtkmodules.vtkCommonDataModel import vtkPolyData
 
 from .body import Body, BodyError, Surface
+from .signed import polydata, signed_distances
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -225,7 +223,7 @@ def _layout(extent: Floats, spacing: float | None, cells_per_axis: Sequence[int]
 def _volume_fractions(surface: Surface, shape: Ints, edges: Floats, depth: int) -> Floats:
     """Share of each cell inside the surface, (nx, ny, nz), in a grid of this shape centred on the origin."""
     positions = np.moveaxis(np.indices(tuple(shape)), 0, -1).reshape(-1, 3)
-    share = _fractions(_polydata(surface), (positions + 0.5 - shape / 2) * edges, edges, depth)
+    share = _fractions(polydata(surface), (positions + 0.5 - shape / 2) * edges, edges, depth)
     share[share > 1 - _ROUND_OFF] = 1.0  # so that whole cells can be told from cut ones
     return share.reshape(tuple(shape))
 
@@ -235,7 +233,7 @@ def _fractions(surface: vtkPolyData, centres: Floats, edges: Floats, depth: int)
     if len(centres) > _AT_ONCE:
         blocks = np.array_split(centres, len(centres) // _AT_ONCE + 1)
         return np.concatenate([_fractions(surface, block, edges, depth) for block in blocks])
-    distances, directions = _signed_distances(surface, centres)
+    distances, directions = signed_distances(surface, centres)
     share = (distances < 0).astype(np.float64)
     cut = np.flatnonzero(np.abs(distances) < np.linalg.norm(edges) / 2)
     if len(cut) and depth == 0:
@@ -269,40 +267,6 @@ def _below_plane(distances: Floats, widths: Floats) -> Floats:
     ]
     share = np.select(bounds, values, (corner - (a - m3) ** 3) / (6 * m1 * m2 * m3))
     return np.where(below < 0.5, share, 1 - share)
-
-
-def _signed_distances(surface: vtkPolyData, points: Floats) -> tuple[Floats, Floats]:
-    """Distances to the surface, (k,), metres, negative inside, and unit vectors along them, (k, 3), of either sign.
-
-    VTK takes the sign from angle-weighted normals, right for closed surfaces also where edges and corners are nearest
-    (Baerentzen and Aanaes 2005).
-    """
-    probe, vertices = _cloud(points), vtkCellArray()
-    vertices.SetData(1, numpy_to_vtkIdTypeArray(np.arange(len(points)), deep=True))
-    probe.SetVerts(vertices)
-    measure = vtkDistancePolyDataFilter()
-    measure.SetInputData(0, probe)
-    measure.SetInputData(1, surface)
-    measure.ComputeSecondDistanceOff()
-    measure.ComputeCellCenterDistanceOff()
-    measure.ComputeDirectionOn()
-    measure.Update()
-    found = measure.GetOutput().GetPointData()
-    return vtk_to_numpy(found.GetArray("Distance")), vtk_to_numpy(found.GetArray("Direction"))
-
-
-def _polydata(surface: Surface) -> vtkPolyData:
-    mesh, triangles = _cloud(surface.points), vtkCellArray()
-    triangles.SetData(3, numpy_to_vtkIdTypeArray(surface.triangles.ravel(), deep=True))
-    mesh.SetPolys(triangles)
-    return mesh
-
-
-def _cloud(points: Floats) -> vtkPolyData:
-    cloud, places = vtkPolyData(), vtkPoints()
-    places.SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=True))
-    cloud.SetPoints(places)
-    return cloud
 
 
 def _at(values: NDArray[Any], positions: Ints) -> NDArray[Any]:

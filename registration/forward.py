@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -9,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
+
+from .conditions import Conditions
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -103,6 +106,16 @@ class ReducedState(Protocol):
         """First-order displacement of every so-manieth chosen node, (p, 3), for a change of the coefficients, (k,)."""
 
 
+class ConditionedState(ReducedState, Protocol):
+    """One that also depends on conditions: what the body is made of, and how it is moved."""
+
+    def by_conditions(self) -> Floats:
+        """Derivative of all nodes' displacement by the conditions' coefficients, (3n, c)."""
+
+    def rows_by_conditions(self, rows: csr_array) -> Floats:
+        """Derivative of linear functions of the chosen displacements, (q, c), for rows (q, 3p)."""
+
+
 class ReducedModel(Protocol):
     """A forward model between the coefficients of a force basis and chosen nodes."""
 
@@ -117,34 +130,61 @@ class ReducedModel(Protocol):
         """The state for coefficients (k,)."""
 
 
+class ConditionedModel(ReducedModel, Protocol):
+    """One whose states also depend on conditions."""
+
+    def solve(self, coefficients: Floats, near: Any = None, unknown: Floats | None = None) -> ConditionedState:
+        """The state for coefficients of forces, (k,), and of conditions, (c,)."""
+
+
 class _PickedState:
     """Any state behind a force basis: rows of the whole."""
 
-    def __init__(self, model: _PickedModel, coefficients: Floats, full: State) -> None:
-        self.model, self.coefficients, self.full = model, coefficients, full
-        self._pushed: Floats | None = None
+    def __init__(self, model: _PickedModel, coefficients: Floats, unknown: Floats, full: Any) -> None:
+        self.model, self.coefficients, self.unknown, self.full = model, coefficients, unknown, full
 
     @property
     def positions(self) -> Floats:
-        return self.full.displacement[self.model.nodes]
+        found: Floats = self.full.displacement[self.model.nodes]
+        return found
 
+    @cached_property
     def _basis_pushed(self) -> Floats:
-        if self._pushed is None:
-            self._pushed = self.full.push(self.model.basis)[self.model.rows]
-        return self._pushed
+        if self.model.count == 0:
+            return np.zeros((len(self.model.rows), 0))
+        pushed: Floats = self.full.push(self.model.basis)[self.model.rows]
+        return pushed
 
     def jacobian(self, rows: csr_array) -> Floats:
-        return rows @ self._basis_pushed()
+        return rows @ self._basis_pushed
 
     def moved(self, change: Floats, every: int = 1) -> Floats:
-        return self._basis_pushed().reshape(-1, 3, len(change))[::every] @ change
+        return self._basis_pushed.reshape(len(self.model.nodes), 3, len(change))[::every] @ change
+
+    @cached_property
+    def _conditions_pushed(self) -> Floats:
+        conditions = self.model.conditions
+        assert conditions is not None
+        pushed: Floats = self.full.push_inputs(conditions.changes(self.unknown))
+        return pushed
+
+    def by_conditions(self) -> Floats:
+        return self._conditions_pushed
+
+    def rows_by_conditions(self, rows: csr_array) -> Floats:
+        return rows @ self._conditions_pushed[self.model.rows]
+
+    def is_at(self, model: _PickedModel, coefficients: Floats, unknown: Floats) -> bool:
+        """Whether it is the state of a model at coefficients."""
+        is_there = np.array_equal(self.coefficients, coefficients) and np.array_equal(self.unknown, unknown)
+        return self.model is model and is_there
 
 
 class _PickedModel:
     """Any forward model, reduced by multiplying with the basis and picking rows."""
 
-    def __init__(self, model: ForwardModel, nodes: Ints, basis: Floats) -> None:
-        self.model, self.nodes, self.basis = model, nodes, basis
+    def __init__(self, model: Any, nodes: Ints, basis: Floats, conditions: Conditions | None) -> None:
+        self.model, self.nodes, self.basis, self.conditions = model, nodes, basis, conditions
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
 
     @property
@@ -152,16 +192,23 @@ class _PickedModel:
         return self.basis.shape[1]
 
     def combined(self, matrix: Floats) -> _PickedModel:
-        return _PickedModel(self.model, self.nodes, self.basis @ matrix)
+        return _PickedModel(self.model, self.nodes, self.basis @ matrix, self.conditions)
 
-    def solve(self, coefficients: Floats, near: ReducedState | None = None) -> _PickedState:
-        if isinstance(near, _PickedState) and near.model is self and np.array_equal(near.coefficients, coefficients):
+    def solve(self, coefficients: Floats, near: ReducedState | None = None, unknown: Floats | None = None) -> Any:
+        """The state; conditions are as expected where no coefficients of theirs are given."""
+        if unknown is None:
+            unknown = np.zeros(0 if self.conditions is None else self.conditions.count)
+        if isinstance(near, _PickedState) and near.is_at(self, coefficients, unknown):
             return near
         forces = (self.basis @ coefficients).reshape(-1, 3)
-        return _PickedState(self, coefficients, self.model.solve(forces, None if near is None else near.full))
+        start = None if near is None else near.full
+        if self.conditions is None:
+            return _PickedState(self, coefficients, unknown, self.model.solve(forces, start))
+        full = self.model.solve(forces, start, self.conditions.inputs(unknown))
+        return _PickedState(self, coefficients, unknown, full)
 
 
-def reduce_model(model: Any, nodes: Ints, basis: Floats) -> ReducedModel:
+def reduce_model(model: Any, nodes: Ints, basis: Floats, conditions: Conditions | None = None) -> ReducedModel:
     """A model from force coefficients to the displacement of some nodes.
 
     A model that has a `reduced` of its own (surrogates multiply beforehand) is asked for it.
@@ -170,8 +217,17 @@ def reduce_model(model: Any, nodes: Ints, basis: Floats) -> ReducedModel:
         model: a forward model.
         nodes: numbers of the nodes whose displacement is wanted, (p,).
         basis: nodal forces of each coefficient, (3n, k), newtons.
+        conditions: unknowns beside the forces, which the model takes as inputs.
+
+    Raises:
+        ValueError: the model was learned for one material and one support, and there are such unknowns.
     """
-    if hasattr(model, "reduced"):
-        found: ReducedModel = model.reduced(nodes, basis)
-        return found
-    return _PickedModel(model, nodes, basis)
+    if not hasattr(model, "reduced"):
+        return _PickedModel(model, nodes, basis, conditions)
+    if conditions is not None:
+        raise ValueError(
+            "conditions: expected a model that takes other parameters and prescribed displacements (the reference, or "
+            f"hybrid), got a {type(model).__name__}, which has learned one material and one support."
+        )
+    found: ReducedModel = model.reduced(nodes, basis)
+    return found

@@ -367,7 +367,7 @@ class LocalModel:
     def step(self, limit: float) -> Floats:
         """The best change of the coefficients that moves no observed node further than the limit, metres."""
         change, damping = self._whole, 0.0
-        while self.largest_movement(change) > 1.05 * limit:
+        while self.largest_movement(change) > 1.05 * limit or self.problem.is_too_far(change):
             self.was_whole = False
             damping = max(1.6 * damping, 1e-8 * self._eigen[0][-1], 0.1)
             change = self._damped(damping)

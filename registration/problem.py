@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .conditions import Conditions
 from .evidence import Scale
-from .forward import ReducedModel, ReducedState
+from .forward import ConditionedModel, ConditionedState, ReducedModel, ReducedState
 from .pose import Pose
 from .residuals import Match, SurfaceDistance
 from .unknowns import Forces, ModelError, PosePrior
@@ -24,7 +26,7 @@ class Trial:
     """The problem at one set of coefficients.
 
     Args:
-        coefficients: of forces, pose and model error, (k,).
+        coefficients: of forces, pose, conditions and model error, (k,).
         state: the body's state as the model has it.
         positions: displacement of the observed nodes with the model's error, (m, 3), metres.
         pose: from the body's coordinates to the cloud's; None where it is not unknown.
@@ -52,6 +54,7 @@ class Problem:
         cloud: points, (p, 3), metres.
         noise: what is believed of the standard deviation of a point's distance, metres.
         error: what the model may get wrong; None where it is not known in patterns.
+        conditions: unknowns beside the forces, which the model takes; None where there are none.
     """
 
     model: ReducedModel
@@ -61,11 +64,12 @@ class Problem:
     cloud: Floats
     noise: Scale
     error: ModelError | None = None
+    conditions: Conditions | None = None
 
     @property
     def size(self) -> int:
-        """Number of coefficients: those of the forces, of the pose, of the model's error."""
-        return self.pose_part.stop + (0 if self.error is None else self.error.count)
+        """Number of coefficients: those of the forces, of the pose, of conditions, of the model's error."""
+        return self.condition_part.stop + (0 if self.error is None else self.error.count)
 
     @cached_property
     def force_part(self) -> slice:
@@ -78,9 +82,15 @@ class Problem:
         return slice(self.forces.size, self.forces.size + (0 if self.pose is None else 6))
 
     @cached_property
+    def condition_part(self) -> slice:
+        """Where those of the conditions are."""
+        begin = self.pose_part.stop
+        return slice(begin, begin + (0 if self.conditions is None else self.conditions.count))
+
+    @cached_property
     def error_part(self) -> slice:
         """Where those of the model's error are."""
-        return slice(self.pose_part.stop, None)
+        return slice(self.condition_part.stop, None)
 
     def trial(self, coefficients: Floats, near: Trial | None = None, *, anew: bool = False) -> Trial:
         """The problem at some coefficients.
@@ -109,13 +119,20 @@ class Problem:
         return self._at(coefficients, near, self.observed.match_nearby)
 
     def _at(self, coefficients: Floats, near: Trial | None, matched: Callable[[Floats, Floats], Match]) -> Trial:
-        state = self.model.solve(coefficients[self.force_part], None if near is None else near.state)
+        state = self._state(coefficients, None if near is None else near.state)
         positions = state.positions
         if self.error is not None:
             positions = positions + self.error.observed_field(coefficients[self.error_part])
         pose = None if self.pose is None else self.pose.pose(coefficients[self.pose_part])
         cloud = self.cloud if pose is None else pose.inverse().apply(self.cloud)
         return Trial(coefficients, state, positions, pose, cloud, matched(positions, cloud))
+
+    def _state(self, coefficients: Floats, near: ReducedState | None) -> ReducedState:
+        forces = coefficients[self.force_part]
+        if self.conditions is None:
+            return self.model.solve(forces, near)
+        conditioned = cast(ConditionedModel, self.model)
+        return conditioned.solve(forces, near, coefficients[self.condition_part])
 
     def correction(self, trial: Trial) -> Floats:
         """What the model's error adds to the displacement of all nodes, (n, 3), metres."""
@@ -157,6 +174,8 @@ class Problem:
         blocks = [trial.state.jacobian(rows)]
         if self.pose is not None:
             blocks.append(self._by_pose(trial))
+        if self.conditions is not None:
+            blocks.append(cast(ConditionedState, trial.state).rows_by_conditions(rows))
         if self.error is not None:
             blocks.append(self.error.jacobian(rows))
         return np.hstack(blocks)
@@ -169,6 +188,8 @@ class Problem:
         blocks = [trial.state.full.pull(full).ravel() @ self.forces.basis]
         if self.pose is not None:
             blocks.append(cotangent @ self._by_pose(trial))
+        if self.conditions is not None:
+            blocks.append(full.ravel() @ cast(ConditionedState, trial.state).by_conditions())
         if self.error is not None:
             blocks.append(self.error.jacobian(by_nodes.ravel()))
         return np.concatenate(blocks)
@@ -188,6 +209,13 @@ class Problem:
             twist = self.pose.deviations * change[self.pose_part]
             arm = self.observed.body.points[self.observed.nodes[::every]] - self.pose.centre
             shifted = shifted + (np.cross(twist[:3], arm) + twist[3:])
+        if self.conditions is not None:
+            pushed = cast(ConditionedState, trial.state).by_conditions().reshape(-1, 3, self.conditions.count)
+            shifted = shifted + pushed[self.observed.nodes[::every]] @ change[self.condition_part]
         if self.error is not None:
             shifted = shifted + self.error.observed_field(change[self.error_part], every)
         return np.sqrt(np.einsum("pi,pi->p", shifted, shifted))
+
+    def is_too_far(self, change: Floats) -> bool:
+        """Whether a change of the coefficients is more than one step may make, however little it moves."""
+        return self.conditions is not None and self.conditions.is_too_far(change[self.condition_part])

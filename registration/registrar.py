@@ -17,6 +17,7 @@ from softtwin.meshes.clouds import check_cloud
 from softtwin.meshes.metrics import edge_lengths
 from softtwin.reference.data.outcome import NotConverged
 
+from .conditions import Conditions, Estimate, Stiffness
 from .evidence import Scale
 from .forward import ForwardModel, ReducedModel, State, reduce_model
 from .gauss_newton import Found, GaussNewton, Step
@@ -29,7 +30,7 @@ from .problem import Problem, Trial
 from .residuals import SurfaceDistance
 from .thinning import thinned
 from .uncertainty import Uncertainty, uncertainty, unseen_response
-from .unknowns import Forces, Informed, ModelError, PosePrior, contact, nodal_forces, told, windowed
+from .unknowns import Forces, Informed, ModelError, PosePrior, contact, known_forces, nodal_forces, told, windowed
 from .verdict import Expectations, Judgement, Verdict, judge
 
 Floats = NDArray[np.float64]
@@ -128,9 +129,11 @@ class Prepared:
     model: ReducedModel
 
     @classmethod
-    def of(cls, model: ForwardModel, observed: SurfaceDistance, forces: Forces) -> Prepared:
+    def of(
+        cls, model: ForwardModel, observed: SurfaceDistance, forces: Forces, conditions: Conditions | None = None
+    ) -> Prepared:
         """What can be multiplied before a cloud comes."""
-        return cls(forces, reduce_model(model, observed.nodes, forces.basis))
+        return cls(forces, reduce_model(model, observed.nodes, forces.basis, conditions))
 
     def informed(self, observed: SurfaceDistance, rule: Informed) -> Prepared:
         """The directions that a cloud can tell: see `unknowns.told`."""
@@ -208,7 +211,7 @@ class Registration:
 
     @property
     def coefficients(self) -> Floats:
-        """Of forces, pose and model error, (k,)."""
+        """Of forces, pose, conditions and model error, (k,)."""
         return self.trial.coefficients
 
     @property
@@ -220,6 +223,38 @@ class Registration:
     def net_force_deviation(self) -> Floats:
         """Standard deviation of each component of the net force, (3,), newtons."""
         return np.sqrt(np.diag(self.net_force_covariance))
+
+    @cached_property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """What is known of stiffness and other unknowns beside the forces; none where there are none."""
+        conditions, part = self.problem.conditions, self.problem.condition_part
+        if conditions is None:
+            return ()
+        return conditions.estimates(self.coefficients[part], self.posterior.covariance[part, part])
+
+    @cached_property
+    def force_over_modulus(self) -> tuple[Floats, Floats] | None:
+        """Net force over Young's modulus, (3,), square metres, and its standard deviation, (3,).
+
+        It is all that a state under nodal forces and fixed supports depends on. None where the modulus is no unknown.
+        """
+        conditions, problem = self.problem.conditions, self.problem
+        if conditions is None:
+            return None
+        begin = problem.condition_part.start
+        for unknown in conditions.unknowns:
+            if isinstance(unknown, Stiffness) and unknown.cells is None:
+                break
+            begin += unknown.count
+        else:
+            return None
+        modulus = float(np.mean(conditions.inputs(self.coefficients[problem.condition_part]).parameters["young_modulus"]))
+        slopes = np.zeros((3, problem.size))
+        slopes[:, problem.force_part] = problem.forces.net_basis / modulus
+        slopes[:, begin] = -unknown.deviation * self.net_force / modulus
+        covariance = slopes @ self.posterior.covariance @ slopes.T
+        left_out = self.posterior.scales.force**2 * problem.forces.left_out / modulus**2
+        return self.net_force / modulus, np.sqrt(np.diag(covariance + left_out))
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
@@ -241,6 +276,10 @@ class Registrar:
         options: noise, solver, thinning, search for the place of the forces.
         pose: prior of the pose; None for clouds in the body's coordinates.
         expectations: what a usable result looks like; by the body's size and the noise if not given.
+        conditions: unknowns beside the forces, which the model takes; none if not given.
+
+    Raises:
+        ValueError: conditions that the model does not take.
     """
 
     def __init__(
@@ -252,16 +291,21 @@ class Registrar:
         *,
         pose: PosePrior | None = None,
         expectations: Expectations | None = None,
+        conditions: Conditions | None = None,
     ) -> None:
         self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
+        self.conditions = conditions
         self.options = options or RegistrationOptions()
         discrepancy = model.discrepancy
         self.error = None if discrepancy is None else ModelError.of(discrepancy, observed.nodes)
         # Where it is not known what the model gets wrong, points tell no more than the model can meet.
         self.noise = self.options.noise.at_least(model.error)
         self.expectations = expectations or Expectations.of(model, self.noise)
-        self._everywhere = Prepared.of(model, observed, forces)
+        self._everywhere = self._prepared(forces)
         self._thorough = self.options.solver.settling(self.options.thorough)
+
+    def _prepared(self, forces: Forces) -> Prepared:
+        return Prepared.of(self.model, self.observed, forces, self.conditions)
 
     def limited(self, until: float) -> Registrar:
         """The same, which begins no step after a time of the monotonic clock, seconds, and gives the best so far."""
@@ -313,9 +357,10 @@ class Registrar:
         begin = time.perf_counter()
         points, solver = self._checked(cloud), self._thorough.following()
         forces = replace(draft.prepared.forces, scale=self.forces.scale)
-        prepared = Prepared.of(self.model, self.observed, forces)
+        prepared = self._prepared(forces)
         problem = self._plain(points, prepared)
-        start = draft.trial.coefficients[: problem.pose_part.stop].copy()
+        start = np.zeros(problem.size)
+        start[: problem.pose_part.stop] = draft.trial.coefficients[: problem.pose_part.stop]
         found = solver.solve(problem, start, problem.begun(start, draft.trial))
         return replace(self._finished(points, prepared, found, begin), draft=draft)
 
@@ -343,7 +388,15 @@ class Registrar:
 
     def _plain(self, points: Floats, prepared: Prepared) -> Problem:
         """The problem with the model's error as the least noise."""
-        return Problem(prepared.model, self.observed, prepared.forces, self.pose, points, self.noise)
+        return Problem(
+            prepared.model,
+            self.observed,
+            prepared.forces,
+            self.pose,
+            points,
+            self.noise,
+            conditions=self.conditions,
+        )
 
     def _problem(self, points: Floats, prepared: Prepared, near: Trial, doubt: float = 1.0) -> Problem:
         """The problem with the model's error in patterns, of the size that belongs to a movement like a trial's."""
@@ -375,6 +428,7 @@ class Registrar:
         start = np.zeros(problem.size)
         start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
         start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
+        start[problem.condition_part] = begun.trial.coefficients[rough.condition_part]
         if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
             solver = solver.without_steps()
         return _after(begun, solver.solve(problem, start, begun.trial))
@@ -443,7 +497,7 @@ class Registrar:
         """The unknown forces once more, where forces were found."""
         body = self.model.body
         where = contact(self.forces, nodal, body.points, self.options.gathering.reach * body.size)
-        every = Prepared.of(self.model, self.observed, windowed(self.forces, where))
+        every = self._prepared(windowed(self.forces, where))
         return every.informed(self.observed, self.options.gathering.informed)
 
     def _is_nearer_at_rest(self, near: Trial, start: Registration) -> bool:
@@ -502,7 +556,7 @@ class Registrar:
 
 def prepare(
     model: ForwardModel,
-    nodes: ArrayLike,
+    nodes: ArrayLike | None,
     triangles: ArrayLike | None = None,
     *,
     force_scale: float,
@@ -510,29 +564,40 @@ def prepare(
     directions: int = 64,
     options: RegistrationOptions | None = None,
     pose: PosePrior | None = None,
+    conditions: Conditions | None = None,
 ) -> Registrar:
     """A registrar with forces at the nodes that may carry some, reduced to what a cloud can tell.
 
     Args:
         model: forward model.
-        nodes: nodes that may carry force.
+        nodes: nodes that may carry force; None where all forces are known (the model's own loading).
         triangles: the observed side, (t, 3); the whole boundary if not given.
         force_scale: size of a nodal force to begin with, newtons; see `expected_force`.
         smoothness: correlation length of neighbouring forces, metres; 0 for none.
         directions: most directions of force kept.
         options: noise, solver, thinning, search for the place of the forces.
         pose: prior of the pose; None for clouds in the body's coordinates.
+        conditions: unknowns beside the forces; none if not given. Nodes that they move carry no unknown force.
 
     Raises:
-        ValueError: no node is left on the free boundary.
+        ValueError: no node is left on the free boundary; nothing is unknown; conditions that the model does not take.
     """
     options = options or RegistrationOptions()
     observed = SurfaceDistance(model.body, triangles)
     scale = Scale(force_scale, _SPREAD, least=1e-2 * force_scale)
-    every = nodal_forces(model.body, nodes, scale, smoothness)
-    rule = Informed(options.noise.least, scale=10.0 * force_scale, most=directions)
-    forces = Prepared.of(model, observed, every).informed(observed, rule).forces
-    return Registrar(model, observed, forces, options, pose=pose)
+    if nodes is None:
+        if conditions is None and pose is None:
+            raise ValueError("prepare.nodes: expected nodes that may carry force where nothing else is unknown.")
+        options = replace(options, gathering=replace(options.gathering, rounds=0))
+        forces = known_forces(model.body, scale)
+    else:
+        carrying = np.asarray(nodes, dtype=np.int64)
+        if conditions is not None:
+            carrying = np.setdiff1d(carrying, conditions.moved)
+        every = nodal_forces(model.body, carrying, scale, smoothness)
+        rule = Informed(options.noise.least, scale=10.0 * force_scale, most=directions)
+        forces = Prepared.of(model, observed, every, conditions).informed(observed, rule).forces
+    return Registrar(model, observed, forces, options, pose=pose, conditions=conditions)
 
 
 def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> RegistrationOptions:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from scipy.stats import chi2
 
 from softtwin.meshes.embedding import Embedding
 
-from .forward import ReducedModel
+from .forward import ConditionedState, ReducedModel
 from .posterior import Posterior
 from .problem import Problem, Trial
 from .unknowns import Forces
@@ -113,11 +114,13 @@ def uncertainty(problem: Problem, trial: Trial, posterior: Posterior, unseen: Fl
         unseen: response to the directions of force that were left out, as from `unseen_response`.
     """
     state = trial.state.full
-    blocks = [state.push(problem.forces.basis)]
+    blocks = [state.push(problem.forces.basis)] if problem.forces.size else []
     if problem.pose is not None and trial.pose is not None:
         places = problem.observed.body.points + state.displacement + problem.correction(trial)
         in_camera = problem.pose.jacobian(trial.coefficients[problem.pose_part], places)
         blocks.append(np.einsum("ji,njk->nik", trial.pose.rotation, in_camera).reshape(-1, 6))
+    if problem.conditions is not None:
+        blocks.append(cast(ConditionedState, trial.state).by_conditions())
     rest = np.zeros(len(problem.observed.body.points))
     if problem.error is not None:
         blocks.append(problem.error.size * problem.error.discrepancy.modes)

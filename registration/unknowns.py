@@ -60,8 +60,8 @@ class Forces:
     def _at_all(self, patterns: Floats) -> Floats:
         count = patterns.shape[1]
         whole = np.zeros((self.count, 3, count))
-        whole[self.nodes] = patterns.reshape(-1, 3, count)
-        return whole.reshape(-1, count)
+        whole[self.nodes] = patterns.reshape(len(self.nodes), 3, count)
+        return whole.reshape(3 * self.count, count)
 
     @property
     def unseen(self) -> Floats | None:
@@ -73,7 +73,7 @@ class Forces:
     def forces(self, coefficients: Floats) -> Floats:
         """Nodal forces, (n, 3), newtons."""
         whole = np.zeros((self.count, 3))
-        whole[self.nodes] = (self.patterns @ coefficients).reshape(-1, 3)
+        whole[self.nodes] = (self.patterns @ coefficients).reshape(len(self.nodes), 3)
         return whole
 
     def combined(self, kept: Floats) -> Forces:
@@ -100,7 +100,7 @@ class Forces:
 
 
 def _net(patterns: Floats) -> Floats:
-    summed: Floats = patterns.reshape(-1, 3, patterns.shape[1]).sum(axis=0)
+    summed: Floats = patterns.reshape(len(patterns) // 3, 3, patterns.shape[1]).sum(axis=0)
     return summed
 
 
@@ -129,6 +129,16 @@ def nodal_forces(body: Body, nodes: ArrayLike, scale: Scale = FORCE, smoothness:
         )
     root = _correlation_root(body.points[chosen], smoothness)
     return Forces(chosen, np.kron(root, np.eye(3)), len(body.points), scale)
+
+
+def known_forces(body: Body, scale: Scale = FORCE) -> Forces:
+    """No unknown force: all that acts is the model's own loading.
+
+    Args:
+        body: the body.
+        scale: without effect.
+    """
+    return Forces(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), len(body.points), scale)
 
 
 def _correlation_root(positions: Floats, smoothness: float) -> Floats:

@@ -57,8 +57,10 @@ class Expectations:
         movement: largest displacement of a node, metres; nothing is known of larger ones.
         outliers: largest share of points that may be wrong.
         extent: largest load relative to what the model has learned.
-        informed: fewest directions that a cloud must tell.
+        informed: fewest directions that a cloud must tell, where so many are unknown.
         pose: largest move of the pose in deviations of its prior.
+        condition: the same of stiffness and other unknowns beside the forces.
+        told: least part of such an unknown's variance that a cloud must take away where all forces are known.
     """
 
     noise: float
@@ -68,6 +70,8 @@ class Expectations:
     extent: float = 1.2
     informed: float = 2.0
     pose: float = 3.0
+    condition: float = 3.0
+    told: float = 0.5
 
     @classmethod
     def of(cls, model: ForwardModel, noise: Scale) -> Expectations:
@@ -103,6 +107,7 @@ def judge(problem: Problem, found: Found, state: State, expected: Expectations) 
         *_of_the_fit(problem, found, expected),
         *_of_the_state(state, expected),
         *_of_the_pose(problem, found, expected),
+        *_of_the_conditions(problem, found, expected),
     ]
     if not findings:
         return Judgement(Verdict.ACCEPTED)
@@ -128,7 +133,7 @@ def _of_the_cloud(problem: Problem, found: Found, expected: Expectations) -> lis
         )
     if len(cloud) < 3 or spread[1] < 0.02 * spread[0]:
         findings.append((Verdict.REFUSED, "the cloud is a line or a spot: it shows no surface"))
-    if found.posterior.informed < expected.informed:
+    if problem.forces.size and found.posterior.informed < expected.informed:
         findings.append(
             (Verdict.DOUBTFUL, f"the cloud tells {found.posterior.informed:.1f} directions of force: hardly anything")
         )
@@ -205,3 +210,24 @@ def _of_the_pose(problem: Problem, found: Found, expected: Expectations) -> list
     return [
         (Verdict.DOUBTFUL, f"the pose lies {largest:.1f} deviations from where it was expected; give a better start")
     ]
+
+
+def _of_the_conditions(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
+    """Unknowns far from where they were expected, and those that the cloud says nothing of.
+
+    With unknown forces the latter is no fault: the prior of the stiffness is what the newtons are worth.
+    """
+    if problem.conditions is None:
+        return []
+    part, findings = problem.condition_part, list[_Finding]()
+    for known in problem.conditions.estimates(found.trial.coefficients[part], found.posterior.covariance[part, part]):
+        if known.deviations > expected.condition:
+            findings.append(
+                (Verdict.DOUBTFUL, f"{known.name} lies {known.deviations:.1f} deviations from where it was expected")
+            )
+        if known.told < expected.told and not problem.forces.size:
+            findings.append(
+                (Verdict.DOUBTFUL, f"the cloud does not tell {known.name} under this load: what is given is what was "
+                                   "expected beforehand")
+            )  # fmt: skip
+    return findings

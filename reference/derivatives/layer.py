@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.inputs import Change
 from ..data.materials import with_parameters
 from ..data.outcome import Equilibrium
 from ..solve.problem import Problem
-from .linearisation import Change, Linearisation
+from .linearisation import Linearisation
 
 Floats = NDArray[np.float64]
 

@@ -6,13 +6,13 @@ eq. 6.8-6.10). The tangent, the adjoint and the sensitivities share one factoris
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..data.inputs import Change
 from ..data.loading import Loading, checked_array, checked_loading
 from ..data.outcome import Equilibrium
 from ..solve.problem import Problem
@@ -43,21 +43,6 @@ class Gradient:
     traction: dict[str, Floats] = field(default_factory=dict)
     pressure: dict[str, float] = field(default_factory=dict)
     points: Floats | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Change:
-    """A direction in which forces, parameters or prescribed displacements change.
-
-    Args:
-        forces: (n, 3); none if not given.
-        parameters: a number or (cells,) for each name; others stay.
-        displacement: (n, 3), its free axes are ignored; none if not given.
-    """
-
-    forces: ArrayLike | None = None
-    parameters: Mapping[str, ArrayLike] = field(default_factory=dict)
-    displacement: ArrayLike | None = None
 
 
 class Linearisation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -11,11 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from softtwin.meshes.body import Body
 
+from ..data.inputs import Change, Inputs
 from ..data.loading import Loading, checked_array
-from ..data.materials import Material
+from ..data.materials import Material, with_parameters
 from ..data.outcome import Equilibrium
 from ..solve.predictor import Adviser, Predictor, check_predictor
 from ..solve.problem import Problem
+from .linearisation import Linearisation
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +35,8 @@ class ReferenceModel:
     """Forces to equilibrium by finite elements, from where a network says if there is one (hybrid Newton).
 
     It remembers no state: what a solve found is the value that it returns. Of a predictor it remembers how long it has
-    been of no use, and asks it the more seldom.
+    been of no use, and asks it the more seldom. Where it is asked for other parameters than its problem's, the problem
+    is left with those of the last call.
 
     Args:
         problem: body, material and options; stays owned by the caller.
@@ -59,6 +63,8 @@ class ReferenceModel:
         if predictor is not None:
             check_predictor(predictor, problem)
         self._adviser = None if predictor is None else Adviser(predictor)
+        self._own = problem.material
+        self._lent: tuple[Inputs, Material] | None = None  # what the problem has been given in place of its own
 
     @property
     def body(self) -> Body:
@@ -74,7 +80,7 @@ class ReferenceModel:
     def discrepancy(self) -> None:
         """None, for the same reason."""
 
-    def solve(self, forces: ArrayLike, near: Start | None = None) -> ReferenceState:
+    def solve(self, forces: ArrayLike, near: Start | None = None, inputs: Inputs | None = None) -> ReferenceState:
         """The state under nodal forces, (n, 3) newtons.
 
         Args:
@@ -82,19 +88,25 @@ class ReferenceModel:
             near: a state to start from. The neighbour of one of this model's is wanted: it is first moved along its
                 tangent by the change of the forces. Another model's is a proposal, which is weighed against the
                 warped linear response. If not given, the predictor's proposal, or that response alone.
+            inputs: parameters and prescribed displacements in place of the problem's own; no predictor is asked then.
 
         Raises:
+            ValueError: parameters or node sets that the problem does not have.
             NotConverged: no equilibrium was found; states that were found before stay as they are.
         """
         given = checked_array("ReferenceModel.forces", forces, self.body.points.shape).copy()
         given.flags.writeable = False
-        fixed = self.loading.forces
-        load = replace(self.loading, forces=given if fixed is None else given + np.asarray(fixed))
+        others = [self.loading.forces, None if inputs is None else inputs.forces]
+        whole = sum((np.asarray(other) for other in others if other is not None), start=given)
+        load = replace(self.loading, forces=whole)
+        if inputs is not None:
+            load = replace(load, displacement={**load.displacement, **inputs.displacement})
+        self._take(inputs)
         guess = near.equilibrium if isinstance(near, ReferenceState) else None
         proposal: Any = None
         if near is not None and guess is None:
             proposal = near.displacement
-        adviser = self._adviser if near is None else None
+        adviser = self._adviser if near is None and inputs is None else None
         if adviser is not None:
             proposal = adviser.proposal(given)
         found = self.problem.solve(
@@ -102,7 +114,52 @@ class ReferenceModel:
         )
         if adviser is not None and proposal is not None:
             adviser.learn(found.start == "proposal")
-        return ReferenceState(given, found, self, self.problem.material)
+        return ReferenceState(given, found, self, self.problem.material, self._own)
+
+    def _take(self, inputs: Inputs | None) -> None:
+        """Give the problem the parameters that are asked for, or its own ones back."""
+        self._look()
+        if inputs is None:
+            if self._lent is not None:
+                self.problem.set_material(self._own)
+                self._lent = None
+            return
+        unknown = inputs.parameters.keys() - self._own.parameters.keys()
+        if unknown:
+            raise ValueError(
+                f"ReferenceModel.inputs: expected parameters among {sorted(self._own.parameters)}, "
+                f"got {sorted(unknown)}."
+            )
+        if self._lent is None or not inputs.has_same_parameters(self._lent[0]):
+            self._lend(inputs, with_parameters(self._own, inputs.parameters))
+
+    def _look(self) -> None:
+        """What the problem has been given by somebody else is its own."""
+        if self._lent is None or self.problem.material is not self._lent[1]:
+            self._own, self._lent = self.problem.material, None
+
+    def _lend(self, inputs: Inputs, material: Material) -> None:
+        self.problem.set_material(material)
+        self._lent = inputs, material
+
+    def take_again(self, material: Material, own: Material) -> None:
+        """Give the problem back what one of this model's states was found with.
+
+        Args:
+            material: the state's.
+            own: the problem's own at that time.
+
+        Raises:
+            RuntimeError: the problem has been given another one by somebody else since.
+        """
+        self._look()
+        if own is not self._own:
+            raise RuntimeError(
+                f"ReferenceState: expected the material that it was found with, {own!r}, "
+                f"got {self._own!r}; solve again after set_material."
+            )
+        if self.problem.material is not material:
+            self._lend(Inputs(material.parameters), material)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,12 +173,14 @@ class ReferenceState:
         equilibrium: what they led to.
         model: where it was found.
         material: that the body had then.
+        own: the problem's own material then.
     """
 
     forces: Floats
     equilibrium: Equilibrium
     model: ReferenceModel
     material: Material
+    own: Material
 
     @property
     def displacement(self) -> Floats:
@@ -142,13 +201,8 @@ class ReferenceState:
     @property
     def _problem(self) -> Problem:
         """The problem, while its tangents are still this state's."""
-        problem = self.model.problem
-        if problem.material is not self.material:
-            raise RuntimeError(
-                f"ReferenceState: expected the material that it was found with, {self.material!r}, "
-                f"got {problem.material!r}; solve again after set_material."
-            )
-        return problem
+        self.model.take_again(self.material, self.own)
+        return self.model.problem
 
     def push(self, changes: ArrayLike) -> Floats:
         """Changes of the displacement, (3n, k), for small changes of the forces, (3n, k).
@@ -157,6 +211,16 @@ class ReferenceState:
             RuntimeError: the problem has been given another material since.
         """
         return self._problem.apply_inverse(changes, self.equilibrium)
+
+    def push_inputs(self, changes: Sequence[Change]) -> Floats:
+        """Changes of the displacement, (3n, k), for small changes of parameters and prescribed displacements.
+
+        Raises:
+            ValueError: parameters that the material does not have.
+            RuntimeError: the problem has been given another material since.
+        """
+        at = Linearisation(self._problem, self.equilibrium.load, self.equilibrium)
+        return np.stack([at.tangent(change).ravel() for change in changes], axis=1)
 
     def pull(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3), from the one with respect to the displacement.

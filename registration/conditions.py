@@ -1,0 +1,420 @@
+"""Unknowns of what a body is made of and of how it is moved, beside the forces: stiffness, Poisson's ratio, a region.
+
+Their coefficients have unit variance beforehand. Under nodal forces that keep their direction, and fixed supports, a
+state depends on forces over stiffness alone: what then tells them apart is the prior, or a load that is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, logit
+
+from softtwin.meshes.body import Body
+from softtwin.reference.data.inputs import Change, Inputs
+from softtwin.reference.data.materials import Parameter
+
+from .pose import Pose
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+LEAST_MODULUS = 10.0  # pascals: nothing softer is an organ
+LOWEST_RATIO, HIGHEST_RATIO = 0.2, 0.5  # open ends (Odot 2023, figure 7.27)
+_DEVIATIONS = 1.6449  # of a normal law: 90 % lie within
+_STRIDE = {"modulus": np.log(10.0), "ratio": 1.5, "turn": 0.3}  # largest change in one step
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is known of one unknown after a cloud.
+
+    Args:
+        name: of the unknown.
+        unit: of the values.
+        value: median.
+        interval: that holds it with 90 %.
+        told: part of its variance beforehand that the cloud has taken away, 0 to 1.
+        deviations: how far it lies from what was expected.
+    """
+
+    name: str
+    unit: str
+    value: float
+    interval: tuple[float, float]
+    told: float
+    deviations: float
+
+
+class Condition(Protocol):
+    """One unknown: coefficients of unit variance to a part of the inputs."""
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+
+    @property
+    def strides(self) -> Floats:
+        """Largest change of each coefficient that one step may make, (count,)."""
+
+    def taken(self, inputs: Inputs, coefficients: Floats, body: Body) -> Inputs:
+        """The inputs with this unknown at coefficients."""
+
+    def changes(self, inputs: Inputs, coefficients: Floats, body: Body) -> list[Change]:
+        """Derivative of the inputs by each coefficient, at the inputs that all unknowns lead to."""
+
+    def estimates(self, inputs: Inputs, mean: Floats, covariance: Floats) -> list[Estimate]:
+        """What is known of it.
+
+        Args:
+            inputs: at all coefficients' medians beforehand.
+            mean: coefficients found, (count,).
+            covariance: of theirs, (count, count).
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Stiffness:
+    """Young's modulus of a body or of a region: E = 10 Pa + (E0 - 10 Pa) exp(s c) with E0 that the body has.
+
+    Args:
+        deviation: s, of the logarithm.
+        cells: numbers of the region's cells; all cells if not given.
+        name: of the region.
+    """
+
+    deviation: float = 0.5
+    cells: Ints | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _check_deviation("Stiffness", self.deviation)
+
+    @property
+    def count(self) -> int:
+        """1."""
+        return 1
+
+    @property
+    def strides(self) -> Floats:
+        """Largest change of the coefficient in one step: ten times as stiff."""
+        return np.array([_STRIDE["modulus"] / self.deviation])
+
+    def taken(self, inputs: Inputs, coefficients: Floats, body: Body) -> Inputs:
+        """The inputs with the body's or the region's stiffness at coefficients."""
+        before = inputs.parameters["young_modulus"]
+        return _with(inputs, young_modulus=self._there(before, self._modulus(before, coefficients[0])))
+
+    def _modulus(self, median: Parameter, coefficient: float) -> Parameter:
+        grown = LEAST_MODULUS + (np.asarray(median) - LEAST_MODULUS) * np.exp(self.deviation * coefficient)
+        return grown if grown.ndim else float(grown)
+
+    def _there(self, elsewhere: Parameter, here: Parameter) -> Parameter:
+        if self.cells is None:
+            return here
+        whole = np.array(elsewhere, dtype=np.float64)
+        whole[self.cells] = np.asarray(here)[self.cells]
+        return whole
+
+    def changes(self, inputs: Inputs, coefficients: Floats, body: Body) -> list[Change]:
+        """Derivative by the coefficient, (cells,)."""
+        whole = np.broadcast_to(inputs.parameters["young_modulus"], (len(body.cells),))
+        slope = self.deviation * (whole - LEAST_MODULUS)
+        return [Change(parameters={"young_modulus": self._there(np.zeros(len(body.cells)), slope)})]
+
+    def estimates(self, inputs: Inputs, mean: Floats, covariance: Floats) -> list[Estimate]:
+        """Young's modulus, pascals, were there no other unknown of stiffness; of several moduli, the mean of theirs."""
+        return [self.estimate(inputs, self.deviation * mean[0], self.deviation**2 * covariance[0, 0], covariance, mean)]
+
+    def estimate(self, inputs: Inputs, grown: float, variance: float, covariance: Floats, mean: Floats) -> Estimate:
+        """The modulus for a change of its logarithm, whose own coefficient's law says what was told.
+
+        Args:
+            inputs: at all coefficients' medians beforehand.
+            grown: logarithm by which the modulus has grown.
+            variance: of that.
+            covariance: of the unknown's own coefficient, (1, 1).
+            mean: of it, (1,).
+        """
+        median = np.asarray(inputs.parameters["young_modulus"])
+        chosen = median if self.cells is None or not median.ndim else median[self.cells]
+
+        def at(change: float) -> float:
+            return float(np.mean(LEAST_MODULUS + (chosen - LEAST_MODULUS) * np.exp(change)))
+
+        name = f"Young's modulus of {self.name}" if self.name else "Young's modulus"
+        found = _estimate(name, "Pa", at, grown, variance)
+        own = _estimate(name, "Pa", at, mean[0], covariance[0, 0])
+        return replace(found, told=own.told, deviations=own.deviations)
+
+
+@dataclass(frozen=True)
+class PoissonRatio:
+    """Poisson's ratio through the logistic map onto ]0.2, 0.5[ (Odot 2023, figure 7.27), normal before it.
+
+    Args:
+        deviation: before the map.
+    """
+
+    deviation: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_deviation("PoissonRatio", self.deviation)
+
+    @property
+    def count(self) -> int:
+        """1."""
+        return 1
+
+    @property
+    def strides(self) -> Floats:
+        """Largest change of the coefficient in one step."""
+        return np.array([_STRIDE["ratio"] / self.deviation])
+
+    def taken(self, inputs: Inputs, coefficients: Floats, body: Body) -> Inputs:
+        """The inputs with the ratio at coefficients."""
+        return _with(inputs, poisson_ratio=self._ratio(inputs.parameters["poisson_ratio"], coefficients[0]))
+
+    def _ratio(self, median: Parameter, coefficient: float) -> Parameter:
+        width = HIGHEST_RATIO - LOWEST_RATIO
+        before = logit((np.asarray(median) - LOWEST_RATIO) / width)
+        found = LOWEST_RATIO + width * expit(before + self.deviation * coefficient)
+        found = np.minimum(found, np.nextafter(HIGHEST_RATIO, 0.0))  # far out, the map ends at 0.5 itself
+        return found if found.ndim else float(found)
+
+    def changes(self, inputs: Inputs, coefficients: Floats, body: Body) -> list[Change]:
+        """Derivative by the coefficient, (cells,)."""
+        ratio = np.broadcast_to(inputs.parameters["poisson_ratio"], (len(body.cells),))
+        slope = (ratio - LOWEST_RATIO) * (HIGHEST_RATIO - ratio) / (HIGHEST_RATIO - LOWEST_RATIO)
+        return [Change(parameters={"poisson_ratio": self.deviation * slope})]
+
+    def estimates(self, inputs: Inputs, mean: Floats, covariance: Floats) -> list[Estimate]:
+        """Poisson's ratio."""
+        median = float(np.mean(inputs.parameters["poisson_ratio"]))
+
+        def at(coefficient: float) -> float:
+            return float(self._ratio(median, coefficient))
+
+        return [_estimate("Poisson's ratio", "", at, mean[0], covariance[0, 0])]
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A node set that is moved as a rigid whole: what grips it, a support that has shifted.
+
+    Args:
+        name: of the node set; the model's problem holds all its axes.
+        turn: standard deviation of the turn about each axis, radians.
+        shift: of the shift along each axis, metres.
+    """
+
+    name: str
+    turn: float = 0.2
+    shift: float = 0.01
+
+    def __post_init__(self) -> None:
+        _check_deviation("Moved.turn", self.turn)
+        _check_deviation("Moved.shift", self.shift)
+
+    @property
+    def count(self) -> int:
+        """6: turn and shift."""
+        return 6
+
+    @property
+    def strides(self) -> Floats:
+        """Largest changes of the coefficients in one step; shifts are held by how far nodes may move."""
+        return np.repeat([_STRIDE["turn"] / self.turn, np.inf], 3)
+
+    def _twist(self, coefficients: Floats) -> Floats:
+        return np.repeat([self.turn, self.shift], 3) * coefficients
+
+    def _places(self, body: Body) -> tuple[Floats, Floats]:
+        places = body.points[body.node_sets[self.name]]
+        return places, places.mean(axis=0)
+
+    def taken(self, inputs: Inputs, coefficients: Floats, body: Body) -> Inputs:
+        """The inputs with the region where coefficients put it."""
+        places, centre = self._places(body)
+        moved = Pose.identity().moved(self._twist(coefficients), centre).apply(places) - places
+        return replace(inputs, displacement={**inputs.displacement, self.name: moved})
+
+    def changes(self, inputs: Inputs, coefficients: Floats, body: Body) -> list[Change]:
+        """Derivative of the prescribed displacements by each coefficient, (n, 3)."""
+        places, centre = self._places(body)
+        columns = Pose.identity().moved_jacobian(places, self._twist(coefficients), centre)
+        found = []
+        for column in (columns * np.repeat([self.turn, self.shift], 3)).T:
+            whole = np.zeros_like(body.points)
+            whole[body.node_sets[self.name]] = column.reshape(-1, 3)
+            found.append(Change(displacement=whole))
+        return found
+
+    def estimates(self, inputs: Inputs, mean: Floats, covariance: Floats) -> list[Estimate]:
+        """Turn, radians, and shift, metres, about and along each axis."""
+        found = []
+        for place, (kind, axis) in enumerate((kind, axis) for kind in ("turn", "shift") for axis in "xyz"):
+            scale, unit = (self.turn, "rad") if kind == "turn" else (self.shift, "m")
+            name = f"{kind} of {self.name} {'about' if kind == 'turn' else 'along'} {axis}"
+            found.append(
+                _estimate(name, unit, lambda c, scale=scale: scale * c, mean[place], covariance[place, place])
+            )
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Conditions:
+    """Several unknowns beside the forces.
+
+    Args:
+        body: the body.
+        parameters: of its material, by name: what is expected of them beforehand.
+        unknowns: each once.
+
+    Raises:
+        ValueError: a parameter that the material does not have, a region of no cells, a ratio out of its map, a set of
+            nodes that the body does not have, stiffness of a region where the material has one for all cells.
+    """
+
+    body: Body
+    parameters: Mapping[str, Parameter]
+    unknowns: tuple[Condition, ...]
+    count: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        for unknown in self.unknowns:
+            self._check(unknown)
+        names = [_name(unknown) for unknown in self.unknowns]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"Conditions.unknowns: expected each unknown once, got {', '.join(twice)} several times.")
+        object.__setattr__(self, "count", sum(unknown.count for unknown in self.unknowns))
+
+    def _check(self, unknown: Condition) -> None:
+        for kind, name in ((Stiffness, "young_modulus"), (PoissonRatio, "poisson_ratio")):
+            if isinstance(unknown, kind) and name not in self.parameters:
+                raise ValueError(
+                    f"Conditions.unknowns: expected unknowns of a material with {sorted(self.parameters)}, got "
+                    f"{kind.__name__}, which needs {name}."
+                )
+        if isinstance(unknown, Stiffness):
+            self._check_stiffness(unknown)
+        if isinstance(unknown, PoissonRatio):
+            ratios = np.asarray(self.parameters["poisson_ratio"])
+            if not ((ratios > LOWEST_RATIO) & (ratios < HIGHEST_RATIO)).all():
+                raise ValueError(
+                    f"Conditions.parameters: expected a Poisson's ratio within ]{LOWEST_RATIO}, {HIGHEST_RATIO}[ where "
+                    f"it is unknown, got {ratios.min():g} to {ratios.max():g}."
+                )
+        if isinstance(unknown, Moved) and unknown.name not in self.body.node_sets:
+            raise ValueError(
+                f"Moved.name: expected a node set among {sorted(self.body.node_sets)}, got {unknown.name!r}."
+            )
+
+    def _check_stiffness(self, unknown: Stiffness) -> None:
+        moduli = np.asarray(self.parameters["young_modulus"])
+        if moduli.min() <= LEAST_MODULUS:
+            raise ValueError(
+                f"Conditions.parameters: expected a Young's modulus above {LEAST_MODULUS:g} Pa where it is unknown, "
+                f"got {moduli.min():g} Pa."
+            )
+        if unknown.cells is None:
+            return
+        if len(unknown.cells) == 0 or unknown.cells.min() < 0 or unknown.cells.max() >= len(self.body.cells):
+            raise ValueError(
+                f"Stiffness.cells: expected numbers of at least one of the body's {len(self.body.cells)} cells, "
+                f"got {len(unknown.cells)} of them."
+            )
+        if moduli.ndim == 0:
+            raise ValueError(
+                "Conditions.parameters: expected one Young's modulus for each cell where a region's is unknown, "
+                "got one for all."
+            )
+
+    @property
+    def expected(self) -> Inputs:
+        """The inputs before any cloud, unknowns left out."""
+        wanted = {"young_modulus", "poisson_ratio"} & self.parameters.keys()
+        return Inputs({name: self.parameters[name] for name in sorted(wanted)})
+
+    @property
+    def moved(self) -> Ints:
+        """Numbers of the nodes whose displacement is prescribed, sorted."""
+        names = [unknown.name for unknown in self.unknowns if isinstance(unknown, Moved)]
+        return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(self.body.node_sets[name] for name in names)]))
+
+    def _parts(self, coefficients: Floats) -> list[tuple[Condition, Floats]]:
+        ends = np.cumsum([unknown.count for unknown in self.unknowns])
+        return list(zip(self.unknowns, np.split(coefficients, ends[:-1]), strict=True))
+
+    def inputs(self, coefficients: Floats) -> Inputs:
+        """The inputs at coefficients, (count,)."""
+        inputs = self.expected
+        for unknown, part in self._parts(coefficients):
+            inputs = unknown.taken(inputs, part, self.body)
+        return inputs
+
+    def changes(self, coefficients: Floats) -> list[Change]:
+        """Derivative of the inputs by each coefficient, count of them."""
+        inputs, found = self.inputs(coefficients), []
+        for unknown, part in self._parts(coefficients):
+            found += unknown.changes(inputs, part, self.body)
+        return found
+
+    def is_too_far(self, change: Floats) -> bool:
+        """Whether a change of the coefficients is more than one step may make."""
+        strides = np.concatenate([unknown.strides for unknown in self.unknowns])
+        return bool((np.abs(change) > strides).any())
+
+    def estimates(self, mean: Floats, covariance: Floats) -> tuple[Estimate, ...]:
+        """What is known of each unknown.
+
+        Args:
+            mean: coefficients found, (count,).
+            covariance: of theirs, (count, count).
+        """
+        found, begin = list[Estimate](), 0
+        for unknown, part in self._parts(mean):
+            own = slice(begin, begin + unknown.count)
+            if isinstance(unknown, Stiffness):
+                along = self._growth(begin, unknown)
+                law = float(along @ mean), float(along @ covariance @ along)
+                found.append(unknown.estimate(self.expected, *law, covariance[own, own], part))
+            else:
+                found += unknown.estimates(self.expected, part, covariance[own, own])
+            begin = own.stop
+        return tuple(found)
+
+    def _growth(self, place: int, unknown: Stiffness) -> Floats:
+        """Derivative of the logarithm of a region's modulus by all coefficients: the body's own change is part of it."""
+        along, begin = np.zeros(self.count), 0
+        for other in self.unknowns:
+            if isinstance(other, Stiffness) and (begin == place or other.cells is None):
+                along[begin] = other.deviation
+            begin += other.count
+        return along
+
+
+def _with(inputs: Inputs, **parameters: Parameter) -> Inputs:
+    return replace(inputs, parameters={**inputs.parameters, **parameters})
+
+
+def _name(unknown: Condition) -> str:
+    return f"{type(unknown).__name__} {getattr(unknown, 'name', '')}".strip()
+
+
+def _check_deviation(name: str, value: float) -> None:
+    if not 0.0 < value < np.inf:
+        raise ValueError(
+            f"{name}: expected a positive deviation, got {value}; without a prior, forces and stiffness cannot be told "
+            "apart."
+        )
+
+
+def _estimate(name: str, unit: str, at: Callable[[float], float], mean: float, variance: float) -> Estimate:
+    reach = _DEVIATIONS * np.sqrt(max(variance, 0.0))
+    told = float(np.clip(1.0 - variance, 0.0, 1.0))
+    return Estimate(name, unit, at(mean), (at(mean - reach), at(mean + reach)), told, float(abs(mean)))
