@@ -165,7 +165,11 @@ class _PickedState:
     def _conditions_pushed(self) -> Floats:
         conditions = self.model.conditions
         assert conditions is not None
-        pushed: Floats = self.full.push_inputs(conditions.changes(self.unknown))
+        changes = conditions.changes(self.unknown)
+        if conditions.has_forces_alone:
+            pushed: Floats = self.full.push(np.stack([np.ravel(change.forces) for change in changes], axis=1))
+        else:
+            pushed = self.full.push_inputs(changes)
         return pushed
 
     def by_conditions(self) -> Floats:
@@ -204,7 +208,10 @@ class _PickedModel:
         start = None if near is None else near.full
         if self.conditions is None:
             return _PickedState(self, coefficients, unknown, self.model.solve(forces, start))
-        full = self.model.solve(forces, start, self.conditions.inputs(unknown))
+        if self.conditions.has_forces_alone:
+            full = self.model.solve(forces + self.conditions.forces(unknown), start)
+        else:
+            full = self.model.solve(forces, start, self.conditions.inputs(unknown))
         return _PickedState(self, coefficients, unknown, full)
 
 
@@ -222,7 +229,8 @@ def reduce_model(model: Any, nodes: Ints, basis: Floats, conditions: Conditions 
     Raises:
         ValueError: the model was learned for one material and one support, and there are such unknowns.
     """
-    if not hasattr(model, "reduced"):
+    every_model_takes_them = conditions is not None and conditions.has_forces_alone
+    if not hasattr(model, "reduced") or every_model_takes_them:
         return _PickedModel(model, nodes, basis, conditions)
     if conditions is not None:
         raise ValueError(

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .evidence import Scales
-from .unknowns import Forces
 
 Floats = NDArray[np.float64]
 
@@ -29,11 +28,14 @@ class Posterior:
     scales: Scales
     informed: float
 
-    def net_force_covariance(self, forces: Forces) -> Floats:
-        """Covariance of the net force, (3, 3), newtons^2, with the prior's share of what was left out."""
-        net = forces.net_basis
-        inner = self.covariance[: forces.size, : forces.size]
-        return net @ inner @ net.T + self.scales.force**2 * forces.left_out
+    def net_force_covariance(self, net: Floats, left_out: Floats) -> Floats:
+        """Covariance of the net force, (3, 3), newtons^2, with the prior's share of what was left out.
+
+        Args:
+            net: net force of each coefficient, (3, k).
+            left_out: covariance for unit scale of directions of force that are no unknowns, (3, 3).
+        """
+        return net @ self.covariance @ net.T + self.scales.force**2 * left_out
 
 
 def posterior(information: Floats, precision: Floats, mean: Floats, scales: Scales, forces: int) -> Posterior:

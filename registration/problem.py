@@ -216,6 +216,21 @@ class Problem:
             shifted = shifted + self.error.observed_field(change[self.error_part], every)
         return np.sqrt(np.einsum("pi,pi->p", shifted, shifted))
 
+    def nodal_forces(self, trial: Trial) -> Floats:
+        """All that is unknown of the nodal forces, (n, 3), newtons."""
+        found = self.forces.forces(trial.coefficients[self.force_part])
+        if self.conditions is not None:
+            found = found + self.conditions.forces(trial.coefficients[self.condition_part])
+        return found
+
+    def net_forces(self, trial: Trial) -> Floats:
+        """Derivative of their net force by the coefficients, (3, k), newtons."""
+        whole = np.zeros((3, self.size))
+        whole[:, self.force_part] = self.forces.net_basis
+        if self.conditions is not None:
+            whole[:, self.condition_part] = self.conditions.net_forces(trial.coefficients[self.condition_part])
+        return whole
+
     def is_too_far(self, change: Floats) -> bool:
         """Whether a change of the coefficients is more than one step may make, however little it moves."""
         return self.conditions is not None and self.conditions.is_too_far(change[self.condition_part])

@@ -249,12 +249,10 @@ class Registration:
         else:
             return None
         modulus = float(np.mean(conditions.inputs(self.coefficients[problem.condition_part]).parameters["young_modulus"]))
-        slopes = np.zeros((3, problem.size))
-        slopes[:, problem.force_part] = problem.forces.net_basis / modulus
-        slopes[:, begin] = -unknown.deviation * self.net_force / modulus
-        covariance = slopes @ self.posterior.covariance @ slopes.T
-        left_out = self.posterior.scales.force**2 * problem.forces.left_out / modulus**2
-        return self.net_force / modulus, np.sqrt(np.diag(covariance + left_out))
+        slopes = problem.net_forces(self.trial) / modulus
+        slopes[:, begin] -= unknown.deviation * self.net_force / modulus
+        covariance = self.posterior.net_force_covariance(slopes, problem.forces.left_out / modulus**2)
+        return self.net_force / modulus, np.sqrt(np.diag(covariance))
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
@@ -524,9 +522,8 @@ class Registrar:
         return check_cloud(points, self.model.body)
 
     def _result(self, problem: Problem, found: Found, prepared: Prepared, begin: float, doubt: float) -> Registration:
-        trial, forces = found.trial, prepared.forces
-        inner = trial.coefficients[problem.force_part]
-        nodal = forces.forces(inner)
+        trial, net = found.trial, problem.net_forces(found.trial)
+        nodal = problem.nodal_forces(trial)
         state = trial.state.full
         return Registration(
             prepared=prepared,
@@ -537,7 +534,7 @@ class Registrar:
             doubt=doubt,
             pose=trial.pose or Pose.identity(),
             net_force=nodal.sum(axis=0),
-            net_force_covariance=found.posterior.net_force_covariance(forces),
+            net_force_covariance=found.posterior.net_force_covariance(net, prepared.forces.left_out),
             noise=found.posterior.scales.noise,
             force_scale=found.posterior.scales.force,
             rms_distance=trial.match.rms,

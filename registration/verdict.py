@@ -215,17 +215,19 @@ def _of_the_pose(problem: Problem, found: Found, expected: Expectations) -> list
 def _of_the_conditions(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
     """Unknowns far from where they were expected, and those that the cloud says nothing of.
 
-    With unknown forces the latter is no fault: the prior of the stiffness is what the newtons are worth.
+    With unknown forces the latter is no fault: the prior of the stiffness is what the newtons are worth. Nor is it one
+    of a contact, which only its place along the surface tells.
     """
     if problem.conditions is None:
         return []
+    is_asked_for = not problem.forces.size and not problem.conditions.has_forces_alone
     part, findings = problem.condition_part, list[_Finding]()
     for known in problem.conditions.estimates(found.trial.coefficients[part], found.posterior.covariance[part, part]):
         if known.deviations > expected.condition:
             findings.append(
                 (Verdict.DOUBTFUL, f"{known.name} lies {known.deviations:.1f} deviations from where it was expected")
             )
-        if known.told < expected.told and not problem.forces.size:
+        if known.told < expected.told and is_asked_for:
             findings.append(
                 (Verdict.DOUBTFUL, f"the cloud does not tell {known.name} under this load: what is given is what was "
                                    "expected beforehand")
