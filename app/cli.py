@@ -215,6 +215,16 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
 @click.option("--rounds", type=int, help="How often a cold start gathers the forces where it has found some.")
 @click.option("--solver", type=click.Choice(["gauss-newton", "l-bfgs"]), help="How the objective is minimised.")
 @click.option("--max-iterations", type=int, help="Most iterations; 0: what the solver is content with.")
+@click.option(
+    "--unknown",
+    "unknowns",
+    multiple=True,
+    help="Unknown beside the forces: young-modulus, young-modulus@TUMOUR, poisson-ratio, moved@ZONE, contact; =DEVIATION "
+    "behind it (may be repeated).",
+)
+@click.option("--known-forces", type=_EXISTING, help="Known nodal forces that act along: .npy (n, 3), newtons.")
+@click.option("--gravity", type=float, nargs=3, help="That acts beyond what the body has at rest, m/s^2.")
+@click.option("--pressure", type=float, help="On the whole boundary, pascals, following it.")
 @click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")
 @click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
 @click.option("--align", type=click.Choice(["auto"]), help="Look for the pose in the first cloud that shows it.")
@@ -264,7 +274,7 @@ def register(
         raise ConfigError(f"--format: expected {', '.join(FORMATS)}, got {', '.join(unknown)}.")
     if sum(given is not None for given in (matrix, landmarks or None, align)) > 1:
         raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
-    options = {name: value for name, value in chosen.items() if value is not None}
+    options = _given(chosen)
     start = Start(matrix, landmarks or None, align is not None)
     if idle is not None and not watch:
         raise ConfigError("--idle: expected --watch beside it.")
@@ -286,6 +296,61 @@ def register(
     click.echo(f"{said or 'no frame'}; written to {output}\n{NOTICE}")
     if strict and verdicts["doubtful"] + verdicts["refused"]:
         sys.exit(3)
+
+
+@softtwin.command()
+@click.argument("twin", type=_EXISTING)
+@click.argument("clouds", nargs=-1, required=True)
+@click.option(
+    "--unknown",
+    "unknowns",
+    multiple=True,
+    required=True,
+    help="What is to be found: young-modulus, young-modulus@TUMOUR, poisson-ratio, moved@ZONE; =DEVIATION behind it (may "
+    "be repeated).",
+)
+@click.option("--known-forces", type=_EXISTING, help="Known nodal forces: .npy (n, 3), newtons.")
+@click.option("--gravity", type=float, nargs=3, help="That acts beyond what the body has at rest, m/s^2.")
+@click.option("--pressure", type=float, help="On the whole boundary, pascals, following it.")
+@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
+@click.option("--noise", type=float, help="Noise of a point, metres, that the search for it begins with.")
+@click.option("--noise-known", is_flag=True, default=None, help="Hold the noise at --noise instead of finding it.")
+@click.option("--points", type=int, help="Most points of a cloud used; larger clouds are thinned.")
+@click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")
+@click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
+@click.option("--output", type=_PATH, default=Path("identification"), show_default=True, help="Folder of the results.")
+def identify(
+    twin: Path,
+    clouds: tuple[str, ...],
+    unit: Unit | None,
+    matrix: Path | None,
+    landmarks: tuple[Path, Path] | None,
+    output: Path,
+    **chosen: Any,
+) -> None:
+    """Find what TWIN is made of from CLOUDS under known loads: stiffness, Poisson's ratio, where a region has gone.
+
+    Each cloud is a state under the same loads, or of the same unknowns; what all of them say together stands at the
+    end, with the interval that holds it with 90 %. An unknown that they do not tell is called so. Ends with code 3
+    where no cloud could be used. Where forces are unknown as well, use `softtwin register --unknown`.
+    """
+    from .identify import identify_files
+    from .register import Start
+
+    if matrix is not None and landmarks:
+        raise ConfigError("--start, --landmarks: expected one of them, got both.")
+    options = _given(chosen) | {"model": "reference", "forces": "known"}
+    start = Start(matrix, landmarks or None)
+    used = identify_files(twin, clouds, output, options, unit=unit, start=start, say=click.echo)
+    click.echo(f"written to {output}\n{NOTICE}")
+    if not used:
+        sys.exit(3)
+
+
+def _given(chosen: dict[str, Any]) -> dict[str, Any]:
+    """Options that were given, as entries of [registration]."""
+    found = {name: value for name, value in chosen.items() if value is not None and value != ()}
+    return {name: str(value) if isinstance(value, Path) else value for name, value in found.items()}
 
 
 @softtwin.command()

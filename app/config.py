@@ -13,6 +13,9 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from softtwin.meshes.attachment import parse_file
 from softtwin.meshes.files import Frame
 
+from .unknowns import WORDS as UNKNOWNS
+from .unknowns import Unknown
+
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 
@@ -85,6 +88,7 @@ class MaterialSection(_Section):
     law: Law = Field("neo-hookean", description="strain energy")
     young_modulus: Positive = Field(5000.0, description="pascals")
     poisson_ratio: float = Field(0.45, gt=0.0, lt=0.5, description="between 0 and 0.5; soft tissue 0.45 to 0.49")
+    density: Positive = Field(1060.0, description="kg/m^3, for weight where gravity acts")
 
 
 class LoadsSection(_Section):
@@ -215,8 +219,40 @@ class RegistrationSection(_Section):
     pose: Literal["auto", "fixed", "unknown"] = Field(
         "auto", description="whether the camera's pose is an unknown beside the forces; auto: where a start is given"
     )
+    forces: Literal["unknown", "known"] = Field(
+        "unknown", description="known: none beside known_forces, gravity and pressure; the unknowns are to be found"
+    )
+    unknowns: tuple[str, ...] = Field((), description=f"unknowns beside the forces: {UNKNOWNS}")
+    known_forces: str = Field("", description="known nodal forces: .npy (n, 3), newtons, on the axes of the files")
+    gravity: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="that acts beyond what the body has at rest, m/s^2, on the axes of the files"
+    )
+    pressure: float = Field(0.0, description="on the whole boundary, pascals, following it (pneumoperitoneum)")
     pose_turn: Positive = Field(5.0, description="how far an unknown pose may turn from its start, degrees")
     pose_shift: Positive = Field(0.01, description="how far an unknown pose may shift from its start, metres")
+
+
+    @model_validator(mode="after")
+    def _unknowns_can_be_found(self) -> RegistrationSection:
+        kinds = [Unknown.parse(text).kind for text in self.unknowns]
+        known = self.known_forces or any(self.gravity) or self.pressure
+        if "contact" in kinds and len(kinds) > 1:
+            raise ValueError(f"registration.unknowns: expected contact alone, got {', '.join(self.unknowns)}")
+        if self.model != "reference" and (known or set(kinds) - {"contact"}):
+            allowed = "reference" if known or "moved" in kinds else "reference or hybrid"
+            if not (self.model == "hybrid" and allowed == "reference or hybrid"):
+                raise ValueError(
+                    f"registration.model: expected {allowed} with unknowns beside the forces or known loads (a network "
+                    f"has learned one material, one support and forces alone), got {self.model}"
+                )
+        if self.model == "hybrid" and "contact" in kinds:
+            raise ValueError("registration.model: expected surrogate or reference with a contact, got hybrid")
+        if self.forces == "known" and not set(kinds) - {"contact"}:
+            raise ValueError(
+                "registration.unknowns: expected at least one (young-modulus, poisson-ratio, moved@NODES) where all "
+                "forces are known, got none"
+            )
+        return self
 
 
 class Config(_Section):

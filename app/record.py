@@ -24,6 +24,7 @@ from .twin import Frame, Twin
 Floats = NDArray[np.float64]
 NOTICE = "Research software: not a medical device."
 RECORD = "registration.json"
+_TOLD = 0.5  # of the variance beforehand: less is called not told
 _EVERY, _SHARE = 1.0, 0.05  # at least so many seconds between two writings, and at most this share of the time on them
 
 
@@ -126,6 +127,12 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "evaluations": result.evaluations,
         "solve_seconds": result.seconds,
     }
+    if result.estimates:
+        row["estimates"] = [asdict(estimate) for estimate in result.estimates]
+    if result.force_over_modulus is not None:
+        ratio, deviation = result.force_over_modulus
+        row["net_force_over_modulus_m2"] = place.directions(ratio).tolist()
+        row["net_force_over_modulus_deviation_m2"] = deviation.tolist()
     if result.draft is not None:  # where the two models of the hybrid engine disagree, and by how much
         apart = np.linalg.norm(result.displacement - result.draft.displacement, axis=1)
         row["draft"] = {
@@ -186,7 +193,9 @@ def describe(row: Mapping[str, Any]) -> str:
     if "net_force_N" not in row:
         return line
     force, doubt = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
-    line += f", cloud to surface {millimetres(row['rms_distance_m'])}, net force {force:.3f} ± {doubt:.3f} N"
+    line += f", cloud to surface {millimetres(row['rms_distance_m'])}"
+    line += f", net force {force:.3f} ± {doubt:.3f} N" if doubt > 0.0 else ""  # none where all forces are known
+    line += "".join(f", {describe_estimate(estimate)}" for estimate in row.get("estimates", ()))
     line += f", {1e3 * row['seconds']:.0f} ms"
     if "age_s" in row:
         line += f", {1e3 * row['age_s']:.0f} ms old{' (late)' if row['is_late'] else ''}"
@@ -197,6 +206,16 @@ def describe(row: Mapping[str, Any]) -> str:
         line += f", {name} moved {millimetres(target['movement_m'], 1)} ± {millimetres(target['margin95_m'], 1)}"
         line += f" ({millimetres(target['error_m'])} off)" if "error_m" in target else ""
     return line
+
+
+def describe_estimate(estimate: Mapping[str, Any]) -> str:
+    """An unknown beside the forces for a person, with the interval that holds it with 90 %, and what the cloud told."""
+    low, high = estimate["interval"]
+    value, unit = estimate["value"], estimate["unit"]
+    if unit == "m":
+        value, low, high, unit = 1e3 * value, 1e3 * low, 1e3 * high, "mm"
+    text = f"{estimate['name']} {value:.4g}{' ' + unit if unit else ''} ({low:.4g} to {high:.4g})"
+    return text if estimate["told"] > _TOLD else f"{text}, not told by the cloud"
 
 
 def millimetres(metres: float, digits: int = 2) -> str:

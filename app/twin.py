@@ -20,6 +20,7 @@ from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import read_body
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import loaded_nodes
+from softtwin.registration.conditions import Conditions
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.hybrid import HybridRegistrar
@@ -35,12 +36,14 @@ from softtwin.registration.registrar import (
     prepare,
 )
 from softtwin.registration.rigid import align
+from softtwin.registration.single import ContactRegistrar
 from softtwin.registration.thinning import thinned
 from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Judgement, Verdict
 
 from .config import Config, ConfigError, RegistrationSection, files_frame, parse_config
 from .inputs import check_material, load_plan
+from .unknowns import Scenario, UnknownError
 from .workspace import open_workspace
 
 if TYPE_CHECKING:
@@ -50,7 +53,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-Engine = Registrar | HybridRegistrar
+Engine = Registrar | HybridRegistrar | ContactRegistrar
 Camera = Pose | PosePrior | Literal["align"] | None
 """Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
 is first looked for in the clouds themselves, None for clouds in the coordinates of the body at rest."""
@@ -335,28 +338,50 @@ class Twin:
 
         def posed(plain: Registrar) -> Registrar:
             options = _options(section, options_for(plain.model, bool(zone), has_pose=True))
-            return Registrar(plain.model, plain.observed, plain.forces, options, pose=camera)
+            return Registrar(
+                plain.model, plain.observed, plain.forces, options, pose=camera, conditions=plain.conditions
+            )
 
         if camera is not None:
             plain = self.registrar(zone)
-            if isinstance(plain, Registrar):
-                return posed(plain)
-            return HybridRegistrar(posed(plain.fast), posed(plain.exact))
+            if isinstance(plain, HybridRegistrar):
+                return HybridRegistrar(posed(plain.fast), posed(plain.exact))
+            if isinstance(plain, ContactRegistrar):
+                return ContactRegistrar(posed(plain.anywhere), plain.patch)
+            return posed(plain)
+        patch = Scenario.of(self.config).patch
         exact = self._alone(self.model, zone)
+        if patch is not None:
+            return ContactRegistrar(exact, patch)
         return exact if self._fast is None else HybridRegistrar(self._alone(self._fast, zone), exact)
+
+    def _conditions(self, model: ForwardModel) -> Conditions | None:
+        """Unknowns beside the forces, for the model that takes them."""
+        if model is self._fast:
+            return None
+        material = self.config.material
+        try:
+            return Scenario.of(self.config).conditions(self.body, material.young_modulus, material.poisson_ratio)
+        except ValueError as error:
+            raise ConfigError(f"registration.unknowns: {error}") from None
 
     def _alone(self, model: ForwardModel, zone: str) -> Registrar:
         body, section = self.body, self.config.registration
         if zone and zone not in body.node_sets:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
+        if section.forces == "known":
+            nodes = None
+        else:
+            nodes = body.node_sets[zone] if zone else loaded_nodes(body, load_plan(self.config))
         return prepare(
             model,
-            body.node_sets[zone] if zone else loaded_nodes(body, load_plan(self.config)),
+            nodes,
             body.surfaces.get("observed"),
             force_scale=section.force_scale or expected_force(body, self.config.material.young_modulus),
             smoothness=section.smoothness,
             directions=section.directions,
             options=_options(section, options_for(model, bool(zone))),
+            conditions=self._conditions(model),
         )
 
 
@@ -527,6 +552,15 @@ def forward_models(
     from softtwin.reference.derivatives.model import ReferenceModel  # FEniCSx is needed here alone
     from softtwin.reference.solve.problem import NewtonOptions, Problem
 
-    material = MATERIALS[config.material.law](config.material.young_modulus, config.material.poisson_ratio)
-    with Problem(body, material, NewtonOptions(tolerance=1e-5, max_iterations=15)) as problem:
-        yield ReferenceModel(problem, patient=False, predictor=network), network
+    scenario, options = Scenario.of(config), NewtonOptions(tolerance=1e-5, max_iterations=15)
+    strange = sorted(scenario.held.keys() - body.node_sets.keys())
+    if strange:
+        raise ConfigError(f"registration.unknowns: expected moved@ one of {sorted(body.node_sets)}, got {strange[0]!r}.")
+    try:
+        loading = scenario.loading(body, coordinates_of(config))
+    except UnknownError as error:
+        raise ConfigError(f"registration.known_forces: {error}") from None
+    modulus = scenario.modulus(config.material.young_modulus, body)
+    material = MATERIALS[config.material.law](modulus, config.material.poisson_ratio)
+    with Problem(body, material, options, held=scenario.held) as problem:
+        yield ReferenceModel(problem, patient=False, loading=loading, predictor=network), network

@@ -77,12 +77,13 @@ class ContactRegistrar:
         found = self._registrar(draft).register(cloud)
         least = max(draft.noise, self.anywhere.noise.least)
         judgement = found.judgement
-        if found.noise > _WORSE * least and judgement.verdict is Verdict.ACCEPTED:
-            judgement = Judgement(
-                Verdict.DOUBTFUL,
-                (f"one contact does not explain the cloud: points lie {1e3 * found.noise:.2f} mm from the surface, with "
-                 f"forces anywhere {1e3 * draft.noise:.2f} mm",),
-            )  # fmt: skip
+        if found.noise > _WORSE * least:
+            reason = (
+                f"one contact does not explain the cloud: points lie {1e3 * found.noise:.2f} mm from the surface, with "
+                f"forces anywhere {1e3 * draft.noise:.2f} mm"
+            )
+            verdict = Verdict.REFUSED if judgement.verdict is Verdict.REFUSED else Verdict.DOUBTFUL
+            judgement = Judgement(verdict, (*judgement.reasons, reason))
         return replace(found, judgement=judgement, draft=draft, seconds=time.perf_counter() - begin)
 
     def _registrar(self, draft: Registration) -> Registrar:
