@@ -13,6 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 from softtwin.reference.data.outcome import NotConverged
 
 from .evidence import Scales, find_scales, linearised
+from .independence import inflation
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .posterior import Posterior, posterior
@@ -59,6 +60,7 @@ class Found:
         outcome: how it ended.
         evaluations: states solved for.
         trace: one entry an iteration.
+        local: the objective's model there.
     """
 
     trial: Trial
@@ -67,6 +69,12 @@ class Found:
     outcome: Outcome
     evaluations: int
     trace: tuple[Step, ...]
+    local: LocalModel
+
+    @classmethod
+    def at(cls, local: LocalModel, outcome: Outcome, evaluations: int, trace: tuple[Step, ...]) -> Found:
+        """What is found where a model of the objective was taken."""
+        return cls(local.trial, local.weights, local.posterior(), outcome, evaluations, trace, local)
 
 
 @dataclass(frozen=True)
@@ -174,7 +182,7 @@ class _Search:
         if Outcome.OUT_OF_TIME in ended:  # far off, the last loss takes all points for outliers, and is content
             outcome = Outcome.OUT_OF_TIME
         local = self._local(self.options.losses[-1])
-        return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
+        return Found.at(local, outcome, self.evaluations, tuple(self.trace))
 
     def _local(self, loss: Loss) -> LocalModel:
         """The model about the trial; what is known there already is not computed again."""
@@ -288,16 +296,17 @@ class LocalModel:
         self.deviations = np.hypot(self.noise, left_out)
         residuals = problem.residuals(trial, self.own)
         self.weights = loss.weight(residuals / self.deviations)
+        self.shared = 1.0 / problem.alike
         self.precision = np.ones(problem.size)
         self.precision[problem.force_part] = 1.0 / self.scales.force**2
-        trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
+        trusted = (np.sqrt(self.shared * self.weights) / self.deviations)[:, None] * self.jacobian
         self.information = trusted.T @ trusted
         self._hessian = self.information + np.diag(self.precision)
         self.gradient = self._gradient(residuals, self.weights)
         self.value = self.objective(trial, loss)
 
     def _gradient(self, residuals: Floats, weights: Floats) -> Floats:
-        by_distances = weights * residuals / self.deviations**2
+        by_distances = self.shared * weights * residuals / self.deviations**2
         return by_distances @ self.jacobian + self.precision * self.trial.coefficients
 
     def _found_scales(self, loss: Loss, noise: float, left_out: Floats, graduation: float) -> tuple[Scales, bool]:
@@ -306,7 +315,8 @@ class LocalModel:
         beside = self.jacobian[:, part.stop :], self.trial.coefficients[part.stop :]
         coefficients, residuals = self.trial.coefficients[part], problem.residuals(self.trial, self.own)
         deviations = np.hypot(noise, left_out)
-        weights, shares = loss.weight(residuals / deviations), (noise / deviations) ** 2
+        weights = loss.weight(residuals / deviations) / problem.alike
+        shares = (noise / deviations) ** 2
         jacobian = self.jacobian[:, part]
         local = linearised(jacobian, residuals, weights, coefficients, loss.consistency, noise, beside, shares)
         scales = find_scales(local, problem.noise, problem.forces.scale)
@@ -345,7 +355,8 @@ class LocalModel:
     def objective(self, trial: Trial, loss: Loss) -> float:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ trial.coefficients**2)
-        return float(loss.value(self.problem.residuals(trial, self.own) / self.deviations).sum()) + prior
+        scaled = self.problem.residuals(trial, self.own) / self.deviations
+        return self.shared * float(loss.value(scaled).sum()) + prior
 
     @property
     def length(self) -> float:
@@ -385,6 +396,11 @@ class LocalModel:
         """Laplace's approximation at the trial."""
         count = self.problem.forces.size
         return posterior(self.information, self.precision, self.trial.coefficients, self.scales, count)
+
+    def alike(self) -> float:
+        """How many points tell what one would that errs by itself, as the residuals here have it; see `inflation`."""
+        scaled = self.problem.residuals(self.trial, self.own) / self.deviations
+        return inflation(self.problem.observed.feet(self.trial.match), scaled, self.weights)
 
 
 def _length(step: Floats, gradient: Floats) -> float:

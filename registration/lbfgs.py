@@ -106,7 +106,7 @@ class _Run:
             noise = local.noise
             outcome = self._descend(loss, local)
         local = LocalModel(self.problem, self.trial, self.options.losses[-1], noise)
-        return Found(self.trial, local.weights, local.posterior(), outcome, self.evaluations, tuple(self.trace))
+        return Found.at(local, outcome, self.evaluations, tuple(self.trace))
 
     def _descend(self, loss: Loss, local: LocalModel) -> Outcome:
         """One run at fixed scales, in coefficients of unit prior variance."""
@@ -154,5 +154,5 @@ class _Run:
 def _objective(problem: Problem, trial: Trial, loss: Loss, local: LocalModel) -> tuple[float, Floats]:
     """Robust distances and their gradient by the coefficients, (k,), at the scales of a model."""
     scaled = problem.residuals(trial, local.own) / local.deviations
-    slope = loss.weight(scaled) * scaled / local.deviations
-    return float(loss.value(scaled).sum()), problem.pulled(trial, slope)
+    slope = local.shared * loss.weight(scaled) * scaled / local.deviations
+    return local.shared * float(loss.value(scaled).sum()), problem.pulled(trial, slope)

@@ -43,6 +43,7 @@ _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
 _DOUBTS, _SURE = 3, 0.1  # times that the model's error is scaled anew; not where that changes it by less
+_SHARES, _AS_MANY = 4, 0.3  # times that it is asked how many points err alike; not where that changes it by less
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
 _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
@@ -166,6 +167,7 @@ class Registration:
         state: the body's state as the model has it, with its derivatives.
         correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres.
         doubt: how large the model's error was found, in units of its samples'; 1 where it is not known in patterns.
+        alike: so many points tell what one would that errs by itself; 1 where each does.
         pose: from the body's coordinates to the cloud's.
         net_force: (3,), newtons.
         net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
@@ -191,6 +193,7 @@ class Registration:
     state: State
     correction: Floats
     doubt: float
+    alike: float
     pose: Pose
     net_force: Floats
     net_force_covariance: Floats
@@ -328,6 +331,7 @@ class Registrar:
         if start is None:
             return self._cold(points, begin)
         problem = self._problem(points, start.prepared, start.trial, start.doubt)
+        problem = replace(problem, alike=start.alike)
         near = problem.begun(start.trial.coefficients.copy(), start.trial)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
             found = self._from_rest(points, start.prepared, self._thorough)
@@ -336,6 +340,7 @@ class Registrar:
             solver = self.options.solver.following()
             found = solver.solve(problem, near.coefficients, near)
             problem, found, doubt = self._doubted(problem, found, start.doubt, solver)
+            problem, found = self._shared(problem, found, solver)
             result = self._result(problem, found, start.prepared, begin, doubt)
         if start.prepared is not self._everywhere and self._has_left(result, start):
             return self._cold(points, begin)
@@ -451,6 +456,8 @@ class Registrar:
             found = _after(found, solver.solve(problem, found.trial.coefficients, found.trial))
         if self.error is not None and not is_hopeless:
             problem, found, doubt = self._doubted(problem, found, doubt, self.options.solver.following())
+        if not is_hopeless:
+            problem, found = self._shared(problem, found, solver.following())
         return self._result(problem, found, believed, begin, doubt)
 
     def _believed(self, prepared: Prepared, found: Found) -> Prepared:
@@ -490,6 +497,23 @@ class Registrar:
             again = solver.last().solve(problem, start, found.trial)
             found = _after(found, again)
         return problem, found, doubt
+
+    def _shared(
+        self, problem: Problem, found: Found, solver: GaussNewton | LBFGS
+    ) -> tuple[Problem, Found]:
+        """Once more where neighbouring points err alike: together they tell less than they are many.
+
+        Noise of a camera, stiffness and meshes that are wrong leave what whole patches share; forces would explain it.
+        """
+        for _ in range(_SHARES):
+            if not found.outcome.is_success:
+                break
+            alike = found.local.alike()
+            if abs(np.log(alike / problem.alike)) < _AS_MANY:
+                break
+            problem = replace(problem, alike=alike)
+            found = _after(found, solver.last().solve(problem, found.trial.coefficients, found.trial))
+        return problem, found
 
     def _gathered(self, nodal: Floats) -> Prepared:
         """The unknown forces once more, where forces were found."""
@@ -532,6 +556,7 @@ class Registrar:
             state=state,
             correction=problem.correction(trial),
             doubt=doubt,
+            alike=problem.alike,
             pose=trial.pose or Pose.identity(),
             net_force=nodal.sum(axis=0),
             net_force_covariance=found.posterior.net_force_covariance(net, prepared.forces.left_out),

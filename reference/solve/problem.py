@@ -87,10 +87,14 @@ class Problem:
         return self.system.material
 
     def close(self) -> None:
-        """Free the PETSc objects; the problem cannot be used after."""
+        """Free the PETSc objects; the problem cannot be used after, nor can derivatives of its states."""
+        if isinstance(self.system, _Closed):
+            return
         self._newton.close()
         self._starts.close()
         self.system.close()
+        gone: Any = _Closed(self.system)  # PETSc ends the process that uses what was given back
+        self.system = self._newton = self._starts = self._space = gone
 
     def __enter__(self) -> Problem:
         return self
@@ -329,3 +333,15 @@ class Problem:
                 given.
         """
         return self.system.tangent.negative_pivots(*self.system.point(displacement))
+
+
+class _Closed:
+    """Stands where a problem's parts were."""
+
+    def __init__(self, system: System) -> None:
+        self.body, self.held, self.material = system.body, system.held, system.material
+
+    def __getattr__(self, name: str) -> Any:
+        raise RuntimeError(
+            "Problem: expected an open problem, got one that was closed; ask for derivatives and deviations before it is."
+        )

@@ -12,6 +12,7 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
+from softtwin.reference.data.inputs import Change, Inputs
 from softtwin.reference.data.materials import IncompressibleNeoHookean, Material, NeoHookean
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.derivatives.model import ReferenceModel, ReferenceState
@@ -220,6 +221,45 @@ def test_a_state_of_another_material_has_no_derivatives_here(box: Body) -> None:
         problem.set_material(NeoHookean(6000.0, 0.4))
         with pytest.raises(RuntimeError, match=r"expected the material that it was found with.*solve again"):
             state.pull(state.displacement)
+
+
+def test_a_closed_problem_says_so(box: Body) -> None:
+    """PETSc would end the process."""
+    with Problem(box, NeoHookean(5000.0, 0.4)) as problem:
+        state = ReferenceModel(problem).solve(tip_force(box))
+    problem.close()
+    assert problem.body is box
+    for use in (
+        lambda: state.push(np.zeros((box.points.size, 1))),
+        lambda: state.pull(state.displacement),
+        lambda: state.push_inputs([Change(parameters={"young_modulus": 1.0})]),
+        lambda: state.negative_pivots,
+        lambda: problem.solve(tip_force(box)),
+        lambda: problem.set_material(NeoHookean(6000.0, 0.4)),
+    ):
+        with pytest.raises(RuntimeError, match="expected an open problem, got one that was closed"):
+            use()
+
+
+def test_inputs_are_a_models_own_again_when_none_are_given(box: Body) -> None:
+    """And states found with others keep their derivatives."""
+    with Problem(box, NeoHookean(5000.0, 0.4), EXACT) as problem:
+        model, forces = ReferenceModel(problem), tip_force(box)
+        own = model.solve(forces)
+        soft = model.solve(forces, own, Inputs({"young_modulus": 2500.0}))
+        with Problem(box, NeoHookean(2500.0, 0.4), EXACT) as other:
+            alone = ReferenceModel(other).solve(forces)
+            np.testing.assert_allclose(soft.displacement, alone.displacement, atol=1e-9)
+            wanted = alone.pull(alone.displacement)
+        again = model.solve(forces)
+        np.testing.assert_allclose(again.displacement, own.displacement, atol=1e-9)
+        np.testing.assert_allclose(soft.pull(soft.displacement), wanted, atol=1e-6 * np.abs(wanted).max())
+        np.testing.assert_allclose(model.solve(forces).displacement, own.displacement, atol=1e-9)
+        with pytest.raises(ValueError, match=r"ReferenceModel\.inputs: expected parameters among .*stiffness"):
+            model.solve(forces, None, Inputs({"stiffness": 1.0}))
+        problem.set_material(NeoHookean(6000.0, 0.4))
+        with pytest.raises(RuntimeError, match="expected the material that it was found with"):
+            soft.pull(soft.displacement)
 
 
 @pytest.mark.liver

@@ -230,6 +230,7 @@ def test_under_dead_forces_a_cloud_tells_forces_over_stiffness_alone(
         ratio, doubt = result.force_over_modulus
         assert (np.abs(ratio - net / 6500.0) < 4.0 * doubt + 1e-2 * 1.0 / 6500.0).all()
         assert doubt[2] < 0.05 * abs(ratio[2])
+        assert result.uncertainty.deviation.max() > 0.0
         model.problem.close()
     assert found["badly"].net_force_deviation[2] > 0.25 * abs(found["badly"].net_force[2])
     assert found["well"].net_force_deviation[2] < 0.08 * abs(found["well"].net_force[2])
