@@ -87,6 +87,12 @@ class MaterialSection(_Section):
 
     law: Law = Field("neo-hookean", description="strain energy")
     young_modulus: Positive = Field(5000.0, description="pascals")
+    young_modulus_deviation: float = Field(
+        0.0,
+        ge=0.0,
+        description="what is not known of it: standard deviation of its logarithm (0.3: a third), which forces found "
+        "are the more in doubt by; displacements under forces alone do not depend on it",
+    )
     poisson_ratio: float = Field(0.45, gt=0.0, lt=0.5, description="between 0 and 0.5; soft tissue 0.45 to 0.49")
     density: Positive = Field(1060.0, description="kg/m^3, for weight where gravity acts")
 

@@ -338,9 +338,7 @@ class Twin:
 
         def posed(plain: Registrar) -> Registrar:
             options = _options(section, options_for(plain.model, bool(zone), has_pose=True))
-            return Registrar(
-                plain.model, plain.observed, plain.forces, options, pose=camera, conditions=plain.conditions
-            )
+            return plain.with_pose(camera, options)
 
         if camera is not None:
             plain = self.registrar(zone)
@@ -369,10 +367,8 @@ class Twin:
         body, section = self.body, self.config.registration
         if zone and zone not in body.node_sets:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
-        if section.forces == "known":
-            nodes = None
-        else:
-            nodes = body.node_sets[zone] if zone else loaded_nodes(body, load_plan(self.config))
+        loaded = loaded_nodes(body, load_plan(self.config))
+        nodes = None if section.forces == "known" else body.node_sets[zone] if zone else loaded
         return prepare(
             model,
             nodes,
@@ -382,6 +378,8 @@ class Twin:
             directions=section.directions,
             options=_options(section, options_for(model, bool(zone))),
             conditions=self._conditions(model),
+            modulus_deviation=self.config.material.young_modulus_deviation,
+            elsewhere=loaded if zone else None,
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,6 +24,7 @@ Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
 _KEPT = 0.2  # a whole step that misses its promise by less: where only a start is wanted, it was the last
 _TRUSTED = 3.0  # deviations
+_NEARER = 1e-3  # part of the objective that closest points searched anew must take away to go on
 _UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
 
 
@@ -207,6 +209,8 @@ class _Search:
                 return Outcome.OUT_OF_TIME
             refused = self._step(local, loss)
             if refused is not None:
+                if not is_handed_on and self._lies_closer(local, loss):
+                    continue
                 return refused
             if is_handed_on and local.was_whole and abs(self.trace[-1].gain - 1.0) < _KEPT:
                 return Outcome.CONVERGED
@@ -223,6 +227,14 @@ class _Search:
         if np.abs(again.match.distances - before).max() >= _UNCHANGED * self.noise:
             self.trial = again
         return local.length_for(again) < settled
+
+    def _lies_closer(self, local: LocalModel, loss: Loss) -> bool:
+        """Search the closest points anew where no step helps; True where a point that had walked astray lies closer."""
+        again = self.problem.again(self.trial)
+        if local.value - local.objective(again, loss) <= _NEARER * local.value:
+            return False
+        self.trial = again
+        return True
 
     def _step(self, local: LocalModel, loss: Loss) -> Outcome | None:
         """Take the best step within the limit; None when one was taken."""
@@ -339,13 +351,19 @@ class LocalModel:
         return values, vectors
 
     @cached_property
-    def _factor(self) -> tuple[Floats, bool]:
-        factor: tuple[Floats, bool] = cho_factor(self._scaled_hessian, check_finite=False)
-        return factor
+    def _factor(self) -> tuple[Floats, bool] | None:
+        """Cholesky's factor; None where information and prior are too far apart for it."""
+        with suppress(np.linalg.LinAlgError):
+            factor: tuple[Floats, bool] = cho_factor(self._scaled_hessian, check_finite=False)
+            return factor
+        return None
 
     def _whole_for(self, gradient: Floats) -> Floats:
         root = 1.0 / np.sqrt(self.precision)
-        return -root * cho_solve(self._factor, root * gradient, check_finite=False)
+        if self._factor is not None:
+            return -root * cho_solve(self._factor, root * gradient, check_finite=False)
+        values, vectors = self._eigen  # with the prior none is below 1, whatever round-off says
+        return -root * (vectors @ (vectors.T @ (root * gradient) / np.maximum(values, 1.0)))
 
     @cached_property
     def _whole(self) -> Floats:

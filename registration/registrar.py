@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -31,7 +32,7 @@ from .residuals import SurfaceDistance
 from .thinning import thinned
 from .uncertainty import Uncertainty, uncertainty, unseen_response
 from .unknowns import Forces, Informed, ModelError, PosePrior, contact, known_forces, nodal_forces, told, windowed
-from .verdict import Expectations, Judgement, Verdict, judge
+from .verdict import Expectations, Judgement, Verdict, judge, shared
 
 Floats = NDArray[np.float64]
 # Of the logarithm of a nodal force: with more, forces explain noise and the model's error. Without either, a pull at a
@@ -43,6 +44,7 @@ _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
 _DOUBTS, _SURE = 3, 0.1  # times that the model's error is scaled anew; not where that changes it by less
+_MISSED, _EXPLAINED = 1.0, 0.5  # times the least noise, shared by neighbours; part of it that forces anywhere leave
 _SHARES, _AS_MANY = 4, 0.3  # times that it is asked how many points err alike; not where that changes it by less
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
 _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
@@ -278,9 +280,13 @@ class Registrar:
         pose: prior of the pose; None for clouds in the body's coordinates.
         expectations: what a usable result looks like; by the body's size and the noise if not given.
         conditions: unknowns beside the forces, which the model takes; none if not given.
+        modulus_deviation: of the logarithm of Young's modulus, where this is no unknown: forces found are the more in
+            doubt by it. Under nodal forces alone states depend on forces over stiffness, and are not.
+        anywhere: the same with forces anywhere: asked where neighbouring points are missed alike; None for forces that
+            act nowhere else.
 
     Raises:
-        ValueError: conditions that the model does not take.
+        ValueError: conditions that the model does not take, or a negative deviation.
     """
 
     def __init__(
@@ -293,9 +299,13 @@ class Registrar:
         pose: PosePrior | None = None,
         expectations: Expectations | None = None,
         conditions: Conditions | None = None,
+        modulus_deviation: float = 0.0,
+        anywhere: Registrar | None = None,
     ) -> None:
+        if not 0.0 <= modulus_deviation < np.inf:
+            raise ValueError(f"Registrar.modulus_deviation: expected 0 or more, got {modulus_deviation}.")
         self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
-        self.conditions = conditions
+        self.conditions, self.modulus_deviation, self.anywhere = conditions, modulus_deviation, anywhere
         self.options = options or RegistrationOptions()
         discrepancy = model.discrepancy
         self.error = None if discrepancy is None else ModelError.of(discrepancy, observed.nodes)
@@ -308,11 +318,25 @@ class Registrar:
     def _prepared(self, forces: Forces) -> Prepared:
         return Prepared.of(self.model, self.observed, forces, self.conditions)
 
+    def with_pose(self, pose: PosePrior, options: RegistrationOptions) -> Registrar:
+        """The same with an unknown pose, and the options that suit it."""
+        return Registrar(
+            self.model,
+            self.observed,
+            self.forces,
+            options,
+            pose=pose,
+            conditions=self.conditions,
+            modulus_deviation=self.modulus_deviation,
+            anywhere=None if self.anywhere is None else self.anywhere.with_pose(pose, options),
+        )
+
     def limited(self, until: float) -> Registrar:
         """The same, which begins no step after a time of the monotonic clock, seconds, and gives the best so far."""
         other = copy.copy(self)
         other.options = replace(self.options, solver=replace(self.options.solver, until=until))
         other._thorough = replace(self._thorough, until=until)
+        other.anywhere = None if self.anywhere is None else self.anywhere.limited(until)
         return other
 
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
@@ -326,6 +350,28 @@ class Registrar:
             CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
             NotConverged: the model found no state at the start.
         """
+        return self._asked(cloud, self._registered(cloud, start))
+
+    def _asked(self, cloud: ArrayLike, found: Registration) -> Registration:
+        """The result, doubtful where forces elsewhere explain what the cloud has left and neighbours share."""
+        if self.anywhere is None or found.judgement.verdict is not Verdict.ACCEPTED:
+            return found
+        match = found.trial.match  # with those points that were taken for outliers: patches of them are none
+        alike = shared(self.observed.feet(match), match.distances, np.ones(len(match.distances)))
+        is_missed = found.rms_distance * np.sqrt(alike) > _MISSED * self.noise.least
+        if not is_missed or time.monotonic() >= self.options.solver.until:
+            return found
+        with suppress(NotConverged):
+            other = self.anywhere.register(cloud)
+            if other.judgement.is_usable and other.rms_distance < _EXPLAINED * found.rms_distance:
+                reason = (
+                    f"forces outside the zone explain the cloud better: points lie {1e3 * found.rms_distance:.2f} mm "
+                    f"from the surface, with forces anywhere {1e3 * other.rms_distance:.2f} mm"
+                )
+                return replace(found, judgement=Judgement(Verdict.DOUBTFUL, (reason,)))
+        return found
+
+    def _registered(self, cloud: ArrayLike, start: Registration | None) -> Registration:
         begin = time.perf_counter()
         points = self._checked(cloud)
         if start is None:
@@ -548,6 +594,9 @@ class Registrar:
     def _result(self, problem: Problem, found: Found, prepared: Prepared, begin: float, doubt: float) -> Registration:
         trial, net = found.trial, problem.net_forces(found.trial)
         nodal = problem.nodal_forces(trial)
+        total = nodal.sum(axis=0)
+        covariance = found.posterior.net_force_covariance(net, prepared.forces.left_out)
+        covariance += self.modulus_deviation**2 * total[:, None] * total
         state = trial.state.full
         return Registration(
             prepared=prepared,
@@ -558,8 +607,8 @@ class Registrar:
             doubt=doubt,
             alike=problem.alike,
             pose=trial.pose or Pose.identity(),
-            net_force=nodal.sum(axis=0),
-            net_force_covariance=found.posterior.net_force_covariance(net, prepared.forces.left_out),
+            net_force=total,
+            net_force_covariance=covariance,
             noise=found.posterior.scales.noise,
             force_scale=found.posterior.scales.force,
             rms_distance=trial.match.rms,
@@ -587,6 +636,8 @@ def prepare(
     options: RegistrationOptions | None = None,
     pose: PosePrior | None = None,
     conditions: Conditions | None = None,
+    modulus_deviation: float = 0.0,
+    elsewhere: ArrayLike | None = None,
 ) -> Registrar:
     """A registrar with forces at the nodes that may carry some, reduced to what a cloud can tell.
 
@@ -600,6 +651,8 @@ def prepare(
         options: noise, solver, thinning, search for the place of the forces.
         pose: prior of the pose; None for clouds in the body's coordinates.
         conditions: unknowns beside the forces; none if not given. Nodes that they move carry no unknown force.
+        modulus_deviation: as for `Registrar`.
+        elsewhere: further nodes, where forces are thought of when those given leave what neighbouring points share.
 
     Raises:
         ValueError: no node is left on the free boundary; nothing is unknown; conditions that the model does not take.
@@ -619,7 +672,29 @@ def prepare(
         every = nodal_forces(model.body, carrying, scale, smoothness)
         rule = Informed(options.noise.least, scale=10.0 * force_scale, most=directions)
         forces = Prepared.of(model, observed, every, conditions).informed(observed, rule).forces
-    return Registrar(model, observed, forces, options, pose=pose, conditions=conditions)
+    anywhere = None
+    if elsewhere is not None and nodes is not None:
+        anywhere = prepare(
+            model,
+            np.union1d(np.asarray(nodes, dtype=np.int64), np.asarray(elsewhere, dtype=np.int64)),
+            triangles,
+            force_scale=force_scale,
+            smoothness=smoothness,
+            directions=directions,
+            options=options,
+            pose=pose,
+            conditions=conditions,
+        )
+    return Registrar(
+        model,
+        observed,
+        forces,
+        options,
+        pose=pose,
+        conditions=conditions,
+        modulus_deviation=modulus_deviation,
+        anywhere=anywhere,
+    )
 
 
 def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> RegistrationOptions:

@@ -1,0 +1,334 @@
+"""The thesis's differentiable engine (section 7.2) on its beam: exactness, force, stiffness and Poisson's ratio as controls.
+
+    python benchmarks/inverse.py [--tables exactness force stiffness ratio sensitivity both]
+
+1 x 0.25 x 0.25 m, 304 hexahedra, Neo-Hookean, 4500 Pa, 0.49; modal loads on one patch of 5.5 to 35 cm. Distances are given as mean over
+the nodes, mean square, and norm over the number of nodes, for the thesis does not say which its figures are.
+Every case counts: one that ends elsewhere or not at all is a failure of its row.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from record import recorded, write
+from scipy.sparse.linalg import splu
+from threadpoolctl import threadpool_limits
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.shapes import beam
+from softtwin.reference.data.inputs import Inputs
+from softtwin.reference.data.loading import Loading
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.data.samplers import LoadPlan
+from softtwin.reference.derivatives.layer import EquilibriumLayer
+from softtwin.reference.derivatives.model import ReferenceModel
+from softtwin.reference.generate import Plan, generate, ramp_loads
+from softtwin.reference.solve.problem import NewtonOptions, Problem
+from softtwin.registration.conditions import Condition, Conditions, PoissonRatio, Stiffness
+from softtwin.registration.evidence import Scale
+from softtwin.registration.forward import reduce_model
+from softtwin.registration.gauss_newton import GaussNewton
+from softtwin.registration.loss import Square
+from softtwin.registration.problem import Problem as Search
+from softtwin.registration.registrar import NOISE, expected_force, prepare
+from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.unknowns import known_forces, nodal_forces
+from softtwin.surrogate.residual import ElasticBody
+
+Floats = NDArray[np.float64]
+NAME = "inverse"
+MODULUS, RATIO, AMPLITUDE = 4500.0, 0.49, 0.03
+TIGHT = NewtonOptions(tolerance=1e-12)
+EXACT = Scale(1e-9, 0.0, least=1e-9)  # metres: clouds without noise
+SOLVER = GaussNewton((Square(),), max_iterations=100, settled=1e-3, least_step=1e-14, graduation=0.0)
+POINTS = 2000
+
+
+def loads(body: Body, count: int) -> Iterator[tuple[int, Floats]]:
+    """Modal loads on one patch, those under which the beam has a stable state, with their numbers."""
+    plan = Plan(
+        "neo-hookean",
+        MODULUS,
+        RATIO,
+        LoadPlan(amplitude=AMPLITUDE, patches=1, radius=(0.055, 0.35)),
+        {"train": 16, "validation": 16, "test": 16},
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        data = generate(Path(folder) / "data.zarr", body, plan)
+        assert data is not None
+        for number in range(10_000, 10_000 + count):
+            load, factors = ramp_loads(data, plan, number)
+            yield number, factors[-1] * load
+
+
+def distances(found: Floats, truth: Floats) -> dict[str, float]:
+    """A distance between two displacements, as everybody may have meant it, metres and square metres."""
+    away = np.linalg.norm(found - truth, axis=1)
+    return {
+        "mean": float(away.mean()),
+        "largest": float(away.max()),
+        "deviation": float(away.std()),
+        "mean_square": float((away**2).mean()),
+        "norm": float(np.linalg.norm(away)),
+        "norm_over_nodes": float(np.linalg.norm(away) / len(away)),
+    }
+
+
+def together(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Mean, deviation and largest of each figure."""
+    return {
+        name: {
+            "mean": float(np.mean([row[name] for row in rows])),
+            "deviation": float(np.std([row[name] for row in rows])),
+            "largest": float(np.max([row[name] for row in rows])),
+        }
+        for name in rows[0]
+    }
+
+
+def minimised(elastic: ElasticBody, forces: Floats, start: Floats, free: NDArray[np.bool_]) -> Floats:
+    """The state of least potential near a start, by torch's energy, forces and stiffness alone (Newton, SuperLU)."""
+    u, b = torch.from_numpy(start.copy())[None], torch.from_numpy(forces)[None]
+    value = float(elastic.potential(u, b))
+    for _ in range(60):
+        gap = (elastic.internal_forces(u) - b)[0].detach().numpy().ravel()
+        stiffness = elastic.stiffness(u[0]).tocsc()[free][:, free]
+        step = np.zeros_like(start).ravel()
+        step[free] = -splu(stiffness.tocsc()).solve(gap[free])
+        length, way = 1.0, torch.from_numpy(step.reshape(1, -1, 3))
+        while length > 1e-6:
+            tried = float(elastic.potential(u + length * way, b))
+            if tried <= value + 1e-12 * abs(value):  # NaN where a cell is inside out
+                break
+            length *= 0.5
+        u, value = u + length * way, tried
+        if np.abs(step).max() < 1e-9:  # the next would be its square
+            break
+    return u[0].numpy()
+
+
+def exactness(body: Body, count: int) -> dict[str, Any]:
+    """Table of figure 7.21: the layer against an independent minimiser that starts from nine tenths of another guess."""
+    elastic, rows, failed, sizes = ElasticBody(body, NeoHookean(MODULUS, RATIO)).double(), [], [], []
+    free = np.ones(body.points.shape, dtype=bool)
+    free[body.fixed] = False
+    spent = {"layer": 0.0, "minimiser": 0.0}
+    with Problem(body, NeoHookean(MODULUS, RATIO), TIGHT) as problem:
+        layer = EquilibriumLayer(problem)
+        for number, forces in loads(body, count):
+            begun = time.perf_counter()
+            try:
+                found = layer(torch.from_numpy(forces)).numpy()
+            except NotConverged:
+                failed.append(number)
+                continue
+            spent["layer"] += time.perf_counter() - begun
+            begun = time.perf_counter()
+            rows.append(distances(found, minimised(elastic, forces, 0.9 * found, free.ravel())))
+            spent["minimiser"] += time.perf_counter() - begun
+            sizes.append(float(np.linalg.norm(found)))
+    within = float(np.mean([row["largest"] <= 1e-9 for row in rows]))
+    return {
+        "loads": count,
+        "failed": failed,
+        "norm_of_displacement_m": {"mean": float(np.mean(sizes)), "deviation": float(np.std(sizes))},
+        "distance": together(rows),
+        "share_within_1e-9": within,
+        "seconds_a_load": {name: value / len(rows) for name, value in spent.items()},
+    }
+
+
+def cloud_of(body: Body, displacement: Floats, rng: np.random.Generator, count: int = POINTS) -> Floats:
+    """Points drawn over the whole deformed surface, without noise, (p, 3), metres."""
+    corners = (body.points + displacement)[body.boundary]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = rng.choice(len(corners), size=count, p=areas / areas.sum())
+    found: Floats = np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), size=count), corners[chosen])
+    return found
+
+
+def force(body: Body, count: int) -> dict[str, Any]:
+    """Section 7.2.2: the force on the true support from bad starts; wrong supports, which are to be called doubtful."""
+    outer = np.setdiff1d(body.boundary_nodes, body.fixed)
+    tip, found = body.node_sets["tip"], dict[str, Any]()
+    rows: dict[str, list[dict[str, float]]] = {"minus the truth": [], "N(0, 1e-2)": []}
+    wrong: dict[str, list[str]] = {"opposite": [], "tip": []}
+    misses: dict[str, list[float]] = {"opposite": [], "tip": []}
+    failed, spent, evaluations = [], [], []
+    with Problem(body, NeoHookean(MODULUS, RATIO), TIGHT) as problem:
+        model, observed = ReferenceModel(problem, patient=False), SurfaceDistance(body)
+        for place, (number, forces) in enumerate(loads(body, count)):
+            rng = np.random.default_rng(number)
+            truth = model.solve(forces).displacement
+            cloud, start = cloud_of(body, truth, rng), list(rows)[place % 2]
+            support = np.flatnonzero(np.abs(forces).sum(axis=1) > 0.0)
+            scale = expected_force(body, MODULUS)
+            unknown = nodal_forces(body, support, Scale(scale, 1.0, least=1e-3 * scale))
+            reduced = reduce_model(model, observed.nodes, unknown.basis)
+            begun = -forces[unknown.nodes].ravel() if place % 2 == 0 else 1e-2 * rng.standard_normal(unknown.size)
+            clock = time.perf_counter()
+            try:
+                search = Search(reduced, observed, unknown, None, cloud, NOISE)
+                ended = GaussNewton().solve(search, begun)
+                solved = ended.evaluations
+                for noise in (1e-5, 1e-6, 1e-7):  # a cloud without noise, believed more and more
+                    search = replace(search, noise=Scale(noise, 0.0, least=noise))
+                    ended = replace(SOLVER, settled=1e-2, trusted=3.0).solve(search, ended.trial.coefficients, ended.trial)
+                    solved += ended.evaluations
+            except NotConverged:
+                failed.append(number)
+                continue
+            spent.append(time.perf_counter() - clock)
+            evaluations.append(solved)
+            row = distances(ended.trial.state.full.displacement, truth)
+            row["force_off"] = float(np.linalg.norm(unknown.forces(ended.trial.coefficients) - forces) / np.linalg.norm(forces))
+            rows[start].append(row)
+            if row["mean"] > 1e-6:
+                failed.append(number)
+            elsewhere = np.setdiff1d(outer, support)
+            mirrored = body.points.max(axis=0) * [0.0, 1.0, 1.0] + body.points[support] * [1.0, -1.0, -1.0]
+            near = np.linalg.norm(body.points[elsewhere][:, None] - mirrored[None], axis=2).argmin(axis=0)
+            for name, nodes in (("opposite", np.unique(elsewhere[near])), ("tip", tip)):
+                try:
+                    registrar = prepare(model, nodes, force_scale=scale, smoothness=0.05, elsewhere=outer)
+                    result = registrar.register(cloud)
+                except (NotConverged, ValueError):
+                    wrong[name].append("no state")
+                    continue
+                wrong[name].append(result.judgement.verdict.value)
+                misses[name].append(float(np.linalg.norm(result.displacement - truth, axis=1).mean()))
+    found["loads"], found["failed"] = count, failed
+    found["starts"] = {name: together(each) for name, each in rows.items() if each}
+    found["seconds"], found["evaluations"] = float(np.mean(spent)), float(np.mean(evaluations))
+    found["wrong support"] = {
+        name: {
+            "verdicts": {verdict: verdicts.count(verdict) for verdict in sorted(set(verdicts))},
+            "mean_nodal_m": float(np.mean(misses[name])) if misses[name] else None,
+        }
+        for name, verdicts in wrong.items()
+    }
+    return found
+
+
+def controlled(
+    body: Body, count: int, unknowns: tuple[Condition, ...], starts: list[dict[str, float]]
+) -> tuple[list[dict[str, float]], list[int], list[float]]:
+    """Material parameters found from clouds under known forces: what they are off, what failed, seconds."""
+    rows, failed, spent = [], [], []
+    observed = SurfaceDistance(body)
+    with Problem(body, NeoHookean(MODULUS, RATIO), TIGHT) as problem:
+        for (number, forces), start in zip(loads(body, count), starts, strict=True):
+            problem.set_material(NeoHookean(MODULUS, RATIO))  # a model leaves its last parameters behind
+            truth = ReferenceModel(problem).solve(forces).displacement
+            cloud = cloud_of(body, truth, np.random.default_rng(number))
+            model = ReferenceModel(problem, patient=True, loading=Loading(forces=forces))
+            conditions = Conditions(body, start, unknowns)
+            none = known_forces(body, Scale(1.0, 0.0))
+            search = Search(
+                reduce_model(model, observed.nodes, none.basis, conditions), observed, none, None, cloud, EXACT,
+                conditions=conditions,
+            )  # fmt: skip
+            clock = time.perf_counter()
+            try:
+                ended = SOLVER.solve(search, np.zeros(conditions.count))
+            except NotConverged:
+                failed.append(number)
+                continue
+            spent.append(time.perf_counter() - clock)
+            inputs = conditions.inputs(ended.trial.coefficients).parameters
+            row = distances(ended.trial.state.full.displacement, truth)
+            row["modulus_off"] = abs(float(inputs["young_modulus"]) / MODULUS - 1.0)
+            row["ratio_off"] = abs(float(inputs["poisson_ratio"]) / RATIO - 1.0)
+            row["evaluations"] = float(ended.evaluations)
+            rows.append(row)
+    return rows, failed, spent
+
+
+def stiffness(body: Body, count: int) -> dict[str, Any]:
+    """Section 7.2.3: Young's modulus from 1e6 to 1e10 Pa towards 4500."""
+    rng = np.random.default_rng(0)
+    starts = [{"young_modulus": float(10.0 ** rng.uniform(6.0, 10.0)), "poisson_ratio": RATIO} for _ in range(count)]
+    rows, failed, spent = controlled(body, count, (Stiffness(10.0),), starts)
+    reached = sum(row["modulus_off"] <= 1e-8 for row in rows)
+    return {"loads": count, "failed": failed, "within_1e-8": reached, **_found(rows, spent)}
+
+
+def ratio(body: Body, count: int) -> dict[str, Any]:
+    """Section 7.2.3: Poisson's ratio from 0.2 to 0.499 towards 0.49."""
+    rng = np.random.default_rng(0)
+    starts = [{"young_modulus": MODULUS, "poisson_ratio": float(rng.uniform(0.2001, 0.499))} for _ in range(count)]
+    rows, failed, spent = controlled(body, count, (PoissonRatio(10.0),), starts)
+    reached = sum(row["ratio_off"] <= 1e-5 for row in rows)
+    return {"loads": count, "failed": failed, "within_1e-5": reached, **_found(rows, spent)}
+
+
+def both(body: Body, count: int) -> dict[str, Any]:
+    """Beyond: both together, from both ranges."""
+    rng = np.random.default_rng(0)
+    starts = [
+        {"young_modulus": float(10.0 ** rng.uniform(3.0, 7.0)), "poisson_ratio": float(rng.uniform(0.25, 0.499))}
+        for _ in range(count)
+    ]
+    rows, failed, spent = controlled(body, count, (Stiffness(10.0), PoissonRatio(10.0)), starts)
+    reached = sum(row["ratio_off"] <= 1e-5 and row["modulus_off"] <= 1e-5 for row in rows)
+    return {"loads": count, "failed": failed, "within_1e-5": reached, **_found(rows, spent)}
+
+
+def _found(rows: list[dict[str, float]], spent: list[float]) -> dict[str, Any]:
+    return {"found": together(rows), "seconds": float(np.mean(spent))} if rows else {}
+
+
+def sensitivity(body: Body, count: int) -> dict[str, Any]:
+    """Figures 7.26 and 7.29: what one per cent of either parameter moves, metres."""
+    rows: dict[str, list[dict[str, float]]] = {}
+    with Problem(body, NeoHookean(MODULUS, RATIO), TIGHT) as problem:
+        model = ReferenceModel(problem)
+        for _, forces in loads(body, count):
+            truth = model.solve(forces)
+            for name, value in (("young_modulus", MODULUS), ("poisson_ratio", RATIO)):
+                for sign in (1, -1):
+                    other = model.solve(forces, truth, Inputs({name: (1.0 + 0.01 * sign) * value}))
+                    row = distances(other.displacement, truth.displacement)
+                    rows.setdefault(f"{name} {'+' if sign > 0 else '-'}1 %", []).append(row)
+    return {"loads": count, **{name: together(each) for name, each in rows.items()}}
+
+
+TABLES = {
+    "exactness": (exactness, 1000),
+    "force": (force, 100),
+    "stiffness": (stiffness, 100),
+    "ratio": (ratio, 100),
+    "both": (both, 100),
+    "sensitivity": (sensitivity, 100),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tables", nargs="+", default=list(TABLES), choices=list(TABLES))
+    parser.add_argument("--count", type=int, help="loads, fewer than the table's, for a look")
+    parser.add_argument("--name", default=NAME, help="of the record")
+    arguments = parser.parse_args()
+    found, body = recorded(arguments.name), beam()
+    for name in arguments.tables:
+        run, count = TABLES[name]
+        if name not in found:
+            with threadpool_limits(1):
+                found[name] = run(body, arguments.count or count)
+            write(arguments.name, found)
+        print(name, found[name], sep="\n  ", flush=True)
+
+
+if __name__ == "__main__":
+    main()
