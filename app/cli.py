@@ -219,8 +219,8 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
     "--unknown",
     "unknowns",
     multiple=True,
-    help="Unknown beside the forces: young-modulus, young-modulus@TUMOUR, poisson-ratio, moved@ZONE, contact; =DEVIATION "
-    "behind it (may be repeated).",
+    help="Unknown beside the forces: young-modulus, young-modulus@TUMOUR, poisson-ratio, moved@ZONE, contact; "
+    "=DEVIATION behind it (may be repeated).",
 )
 @click.option("--known-forces", type=_EXISTING, help="Known nodal forces that act along: .npy (n, 3), newtons.")
 @click.option("--gravity", type=float, nargs=3, help="That acts beyond what the body has at rest, m/s^2.")
@@ -306,8 +306,8 @@ def register(
     "unknowns",
     multiple=True,
     required=True,
-    help="What is to be found: young-modulus, young-modulus@TUMOUR, poisson-ratio, moved@ZONE; =DEVIATION behind it (may "
-    "be repeated).",
+    help="What is to be found: young-modulus, young-modulus@TUMOUR, poisson-ratio, moved@ZONE; =DEVIATION behind it "
+    "(may be repeated).",
 )
 @click.option("--known-forces", type=_EXISTING, help="Known nodal forces: .npy (n, 3), newtons.")
 @click.option("--gravity", type=float, nargs=3, help="That acts beyond what the body has at rest, m/s^2.")

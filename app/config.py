@@ -237,7 +237,6 @@ class RegistrationSection(_Section):
     pose_turn: Positive = Field(5.0, description="how far an unknown pose may turn from its start, degrees")
     pose_shift: Positive = Field(0.01, description="how far an unknown pose may shift from its start, metres")
 
-
     @model_validator(mode="after")
     def _unknowns_can_be_found(self) -> RegistrationSection:
         kinds = [Unknown.parse(text).kind for text in self.unknowns]

@@ -337,6 +337,7 @@ class Twin:
         section = self.config.registration
 
         def posed(plain: Registrar) -> Registrar:
+            assert camera is not None
             options = _options(section, options_for(plain.model, bool(zone), has_pose=True))
             return plain.with_pose(camera, options)
 
@@ -553,7 +554,9 @@ def forward_models(
     scenario, options = Scenario.of(config), NewtonOptions(tolerance=1e-5, max_iterations=15)
     strange = sorted(scenario.held.keys() - body.node_sets.keys())
     if strange:
-        raise ConfigError(f"registration.unknowns: expected moved@ one of {sorted(body.node_sets)}, got {strange[0]!r}.")
+        raise ConfigError(
+            f"registration.unknowns: expected moved@ one of {sorted(body.node_sets)}, got {strange[0]!r}."
+        )
     try:
         loading = scenario.loading(body, coordinates_of(config))
     except UnknownError as error:

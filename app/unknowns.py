@@ -61,7 +61,7 @@ class Unknown:
         if found is None or kind not in _PLACED:
             raise UnknownError(f"expected {WORDS}, got {text!r}")
         placed = bool(found["place"])
-        if placed and _PLACED[kind] == "never" or not placed and _PLACED[kind] == "always":
+        if (placed and _PLACED[kind] == "never") or (not placed and _PLACED[kind] == "always"):
             raise UnknownError(f"expected {'moved@NODES' if kind == 'moved' else kind}, got {text!r}")
         return cls(kind, found["place"] or "", _positive(found["number"], text))
 

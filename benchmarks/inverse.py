@@ -1,9 +1,9 @@
-"""The thesis's differentiable engine (section 7.2) on its beam: exactness, force, stiffness and Poisson's ratio as controls.
+"""The thesis's differentiable engine (section 7.2) on its beam: exactness; force, stiffness, Poisson's ratio as controls.
 
     python benchmarks/inverse.py [--tables exactness force stiffness ratio sensitivity both]
 
-1 x 0.25 x 0.25 m, 304 hexahedra, Neo-Hookean, 4500 Pa, 0.49; modal loads on one patch of 5.5 to 35 cm. Distances are given as mean over
-the nodes, mean square, and norm over the number of nodes, for the thesis does not say which its figures are.
+1 x 0.25 x 0.25 m, 304 hexahedra, Neo-Hookean, 4500 Pa, 0.49; modal loads on one patch of 5.5 to 35 cm. Distances are
+given as mean over the nodes, mean square, and norm over the number of nodes, for the thesis does not say which its are.
 Every case counts: one that ends elsewhere or not at all is a failure of its row.
 """
 
@@ -119,7 +119,7 @@ def minimised(elastic: ElasticBody, forces: Floats, start: Floats, free: NDArray
 
 
 def exactness(body: Body, count: int) -> dict[str, Any]:
-    """Table of figure 7.21: the layer against an independent minimiser that starts from nine tenths of another guess."""
+    """Table of figure 7.21: the layer against an independent minimiser that starts from nine tenths of its state."""
     elastic, rows, failed, sizes = ElasticBody(body, NeoHookean(MODULUS, RATIO)).double(), [], [], []
     free = np.ones(body.points.shape, dtype=bool)
     free[body.fixed] = False
@@ -184,7 +184,9 @@ def force(body: Body, count: int) -> dict[str, Any]:
                 solved = ended.evaluations
                 for noise in (1e-5, 1e-6, 1e-7):  # a cloud without noise, believed more and more
                     search = replace(search, noise=Scale(noise, 0.0, least=noise))
-                    ended = replace(SOLVER, settled=1e-2, trusted=3.0).solve(search, ended.trial.coefficients, ended.trial)
+                    ended = replace(SOLVER, settled=1e-2, trusted=3.0).solve(
+                        search, ended.trial.coefficients, ended.trial
+                    )
                     solved += ended.evaluations
             except NotConverged:
                 failed.append(number)
@@ -192,7 +194,9 @@ def force(body: Body, count: int) -> dict[str, Any]:
             spent.append(time.perf_counter() - clock)
             evaluations.append(solved)
             row = distances(ended.trial.state.full.displacement, truth)
-            row["force_off"] = float(np.linalg.norm(unknown.forces(ended.trial.coefficients) - forces) / np.linalg.norm(forces))
+            row["force_off"] = float(
+                np.linalg.norm(unknown.forces(ended.trial.coefficients) - forces) / np.linalg.norm(forces)
+            )
             rows[start].append(row)
             if row["mean"] > 1e-6:
                 failed.append(number)

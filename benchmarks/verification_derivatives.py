@@ -12,9 +12,9 @@ from verification_cases import Floats, box, incompressible, shaken
 from verification_solutions import TIGHT, Row, Waves, orders
 
 from softtwin.meshes.body import Body
+from softtwin.reference.data.inputs import Change
 from softtwin.reference.data.materials import Energy, Material
 from softtwin.reference.data.outcome import Equilibrium
-from softtwin.reference.data.inputs import Change
 from softtwin.reference.derivatives.linearisation import Gradient, Linearisation
 from softtwin.reference.fem.forms import DiscreteLoad
 from softtwin.reference.solve.problem import Loading, Problem

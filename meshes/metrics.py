@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .body import HEXAHEDRON_FACES, TETRAHEDRON_FACES, Body, Floats, Ints, corner_jacobians
+from .elements import linear_kind
+from .quadrature import quadrature, shape_functions
 
 # Local edges of a cell (VTK numbering), and the two faces that meet at each edge of a tetrahedron.
 TETRAHEDRON_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
@@ -98,6 +100,28 @@ def relative_error(displacement: ArrayLike, truth: ArrayLike) -> Floats:
     found, true = _pair(displacement, truth)
     error, norm = _norm(found - true), _norm(true)
     return np.divide(error, norm, out=np.where(error > 0, np.inf, 0.0), where=norm > 0)
+
+
+def displacement_gradients(body: Body, displacement: ArrayLike) -> Floats:
+    """Gradient of a displacement in the middle of each cell, (m, 3, 3), by the corners: du_i / dX_j.
+
+    Args:
+        body: the body.
+        displacement: of its nodes, (n, 3), metres.
+
+    Raises:
+        ValueError: another shape.
+    """
+    moved = np.asarray(displacement, dtype=np.float64)
+    if moved.shape != body.points.shape:
+        raise ValueError(f"displacement: expected shape {body.points.shape}, got {moved.shape}.")
+    kind = linear_kind(body.kind)
+    middle = quadrature(kind, 1)[0].mean(axis=0, keepdims=True)
+    slopes = shape_functions(kind, middle)[1][0]
+    corners, vectors = body.points[body.corner_cells], moved[body.corner_cells]
+    by_cell = np.linalg.inv(np.einsum("cki,kj->cij", corners, slopes))
+    found: Floats = np.einsum("cki,kj,cjl->cil", vectors, slopes, by_cell)
+    return found
 
 
 def thesis_error(displacement: ArrayLike, truth: ArrayLike) -> Floats:

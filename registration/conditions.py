@@ -258,10 +258,12 @@ class Moved:
         found = []
         for place, (kind, axis) in enumerate((kind, axis) for kind in ("turn", "shift") for axis in "xyz"):
             scale, unit = (self.turn, "rad") if kind == "turn" else (self.shift, "m")
+
+            def at(c: float, scale: float = scale) -> float:
+                return scale * c
+
             name = f"{kind} of {self.name} {'about' if kind == 'turn' else 'along'} {axis}"
-            found.append(
-                _estimate(name, unit, lambda c, scale=scale: scale * c, mean[place], covariance[place, place])
-            )
+            found.append(_estimate(name, unit, at, mean[place], covariance[place, place]))
         return found
 
 
@@ -336,7 +338,9 @@ class Contact:
             def at(c: float, middle: float = middle, scale: float = scale) -> float:
                 return float(middle + scale * c)
 
-            found.append(_estimate(f"{kind} of the contact along {'xyz'[axis]}", unit, at, mean[place], covariance[place, place]))
+            found.append(
+                _estimate(f"{kind} of the contact along {'xyz'[axis]}", unit, at, mean[place], covariance[place, place])
+            )
         return found
 
 
@@ -480,7 +484,7 @@ class Conditions:
         return tuple(found)
 
     def _growth(self, place: int, unknown: Stiffness) -> Floats:
-        """Derivative of the logarithm of a region's modulus by all coefficients: the body's own change is part of it."""
+        """Derivative of the logarithm of a region's modulus by all coefficients: the body's own change included."""
         along, begin = np.zeros(self.count), 0
         for other in self.unknowns:
             if isinstance(other, Stiffness) and (begin == place or other.cells is None):

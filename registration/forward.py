@@ -167,7 +167,9 @@ class _PickedState:
         assert conditions is not None
         changes = conditions.changes(self.unknown)
         if conditions.has_forces_alone:
-            pushed: Floats = self.full.push(np.stack([np.ravel(change.forces) for change in changes], axis=1))
+            pushed: Floats = self.full.push(
+                np.stack([np.asarray(change.forces, dtype=np.float64).ravel() for change in changes], axis=1)
+            )
         else:
             pushed = self.full.push_inputs(changes)
         return pushed

@@ -253,7 +253,9 @@ class Registration:
             begin += unknown.count
         else:
             return None
-        modulus = float(np.mean(conditions.inputs(self.coefficients[problem.condition_part]).parameters["young_modulus"]))
+        modulus = float(
+            np.mean(conditions.inputs(self.coefficients[problem.condition_part]).parameters["young_modulus"])
+        )
         slopes = problem.net_forces(self.trial) / modulus
         slopes[:, begin] -= unknown.deviation * self.net_force / modulus
         covariance = self.posterior.net_force_covariance(slopes, problem.forces.left_out / modulus**2)
@@ -354,7 +356,7 @@ class Registrar:
 
     def _asked(self, cloud: ArrayLike, found: Registration) -> Registration:
         """The result, doubtful where forces elsewhere explain what the cloud has left and neighbours share."""
-        if self.anywhere is None or found.judgement.verdict is not Verdict.ACCEPTED:
+        if self.anywhere is None or not found.judgement.is_usable:
             return found
         match = found.trial.match  # with those points that were taken for outliers: patches of them are none
         alike = shared(self.observed.feet(match), match.distances, np.ones(len(match.distances)))
@@ -368,7 +370,8 @@ class Registrar:
                     f"forces outside the zone explain the cloud better: points lie {1e3 * found.rms_distance:.2f} mm "
                     f"from the surface, with forces anywhere {1e3 * other.rms_distance:.2f} mm"
                 )
-                return replace(found, judgement=Judgement(Verdict.DOUBTFUL, (reason,)))
+                reasons = (*found.judgement.reasons, reason)
+                return replace(found, judgement=Judgement(Verdict.DOUBTFUL, reasons))
         return found
 
     def _registered(self, cloud: ArrayLike, start: Registration | None) -> Registration:
@@ -544,9 +547,7 @@ class Registrar:
             found = _after(found, again)
         return problem, found, doubt
 
-    def _shared(
-        self, problem: Problem, found: Found, solver: GaussNewton | LBFGS
-    ) -> tuple[Problem, Found]:
+    def _shared(self, problem: Problem, found: Found, solver: GaussNewton | LBFGS) -> tuple[Problem, Found]:
         """Once more where neighbouring points err alike: together they tell less than they are many.
 
         Noise of a camera, stiffness and meshes that are wrong leave what whole patches share; forces would explain it.

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from softtwin.meshes.metrics import displacement_gradients
+
 from .evidence import Scale
 from .forward import ForwardModel, State
 from .gauss_newton import Found
@@ -19,6 +21,7 @@ Floats = NDArray[np.float64]
 _NEIGHBOURS = 6
 _ASKED = 250  # points at least, whose neighbours are looked at
 _FEWEST_POINTS = 30
+_SMALL, _NEARLY_ALL = 0.1, 95.0  # turn (radians) or stretch that a linear law holds for; per cent of the cells
 
 
 class Verdict(Enum):
@@ -60,6 +63,7 @@ class Expectations:
         informed: fewest directions that a cloud must tell, where so many are unknown.
         pose: largest move of the pose in deviations of its prior.
         condition: the same of stiffness and other unknowns beside the forces.
+        gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
         told: least part of such an unknown's variance that a cloud must take away where all forces are known.
     """
 
@@ -72,6 +76,7 @@ class Expectations:
     pose: float = 3.0
     condition: float = 3.0
     told: float = 0.5
+    gradient: float = np.inf
 
     @classmethod
     def of(cls, model: ForwardModel, noise: Scale) -> Expectations:
@@ -86,6 +91,7 @@ class Expectations:
             noise=max(0.025 * size, 3.0 * noise.median),
             systematic=max(0.005 * size, noise.median),
             movement=0.35 * size,
+            gradient=_SMALL if getattr(model, "is_linear", False) else np.inf,
         )
 
 
@@ -191,6 +197,14 @@ def _of_the_state(problem: Problem, state: State, expected: Expectations) -> lis
             (Verdict.REFUSED, f"a node moved {1e3 * movement:.0f} mm; an organ of this size does not move more than "
                               f"{1e3 * expected.movement:.0f} mm")
         )  # fmt: skip
+    if expected.gradient < np.inf:
+        gradients = displacement_gradients(problem.observed.body, state.displacement)
+        most = float(np.percentile(np.linalg.norm(gradients, ord=2, axis=(1, 2)), _NEARLY_ALL))
+        if most > expected.gradient:
+            findings.append(
+                (Verdict.DOUBTFUL, f"parts of the organ turn or stretch by {100 * most:.0f} %; its law is linear, "
+                                   f"which holds up to {100 * expected.gradient:.0f} %")
+            )  # fmt: skip
     extent = state.extent
     if extent is not None and extent > expected.extent:
         verdict = Verdict.REFUSED if extent > 2.0 * expected.extent else Verdict.DOUBTFUL

@@ -139,6 +139,12 @@ class Surrogate:
         names = ("material", "young_modulus", "poisson_ratio")
         return {name: plan[name] for name in names} if all(name in plan for name in names) else None
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether the law that it has learned is linear; False where that is not known."""
+        plan = self.card.get("data", {}).get("plan", {})
+        return bool(plan.get("material") == "linear-elastic")
+
     @cached_property
     def discrepancy(self) -> Discrepancy | None:
         """The errors of the validation samples as patterns; None where they were not measured."""

@@ -80,6 +80,11 @@ class ReferenceModel:
     def discrepancy(self) -> None:
         """None, for the same reason."""
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether the law is linear: it holds where nothing turns or stretches much."""
+        return self.problem.material.is_linear
+
     def solve(self, forces: ArrayLike, near: Start | None = None, inputs: Inputs | None = None) -> ReferenceState:
         """The state under nodal forces, (n, 3) newtons.
 

@@ -345,5 +345,5 @@ class _Closed:
 
     def __getattr__(self, name: str) -> Any:
         raise RuntimeError(
-            "Problem: expected an open problem, got one that was closed; ask for derivatives and deviations before it is."
+            "Problem: expected an open problem, got one that was closed; ask for derivatives and deviations before."
         )

@@ -5,6 +5,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.metrics import (
     cell_volumes,
     dihedral_angles,
+    displacement_gradients,
     mesh_quality,
     net_force_error,
     nodal_errors,
@@ -125,3 +126,12 @@ def test_plane_meshes_have_their_own_quality() -> None:
     triangles = Body(points, squares[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), {})
     assert mesh_quality(triangles).kind == "triangles" and mesh_quality(triangles).volume == pytest.approx(0.04)
     assert scaled_jacobians(np.array([[0, 0], [1, 0], [0.5, np.sqrt(0.75)]]), np.arange(3)[None]) == pytest.approx([1])
+
+
+def test_displacement_gradients_of_a_linear_field_are_exact(any_beam: Body, rng: np.random.Generator) -> None:
+    slope = rng.standard_normal((3, 3))
+    for body in (any_beam, any_beam.quadratic()):
+        found = displacement_gradients(body, body.points @ slope.T + rng.standard_normal(3))
+        np.testing.assert_allclose(found, np.broadcast_to(slope, found.shape), atol=1e-12)
+    with pytest.raises(ValueError, match="displacement: expected shape"):
+        displacement_gradients(any_beam, np.zeros((3, 3)))

@@ -7,7 +7,7 @@ import pytest
 
 from softtwin.meshes.body import Body
 from softtwin.registration.evidence import Scale
-from softtwin.registration.registrar import Registrar
+from softtwin.registration.registrar import Registrar, expected_force, prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import nodal_forces
 from softtwin.registration.verdict import Verdict, shared
@@ -67,3 +67,30 @@ def test_noise_is_shared_by_no_neighbours(rng) -> None:
     assert shared(cloud, white, np.ones(2000)) < 0.05
     assert shared(cloud, np.sin(6.0 * cloud[:, 0]), np.ones(2000)) > 0.95
     assert shared(cloud, np.zeros(2000), np.ones(2000)) == 0.0
+
+
+@pytest.mark.fenicsx
+@pytest.mark.parametrize(("newtons", "verdict"), [(0.03, Verdict.ACCEPTED), (0.5, Verdict.DOUBTFUL)])
+def test_a_linear_law_is_believed_where_little_turns(
+    body: Body, rng: np.random.Generator, newtons: float, verdict: Verdict
+) -> None:
+    """The organ is Neo-Hookean: bent far, the linear beam explains the cloud well, and is wrong."""
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    from softtwin.reference.data.materials import LinearElastic, NeoHookean
+    from softtwin.reference.derivatives.model import ReferenceModel
+    from softtwin.reference.solve.problem import Problem
+
+    with Problem(body, NeoHookean(5000.0, 0.42)) as problem:
+        truth = problem.solve(tip_forces(body, (0.0, 0.0, -newtons))).displacement
+    with Problem(body, LinearElastic(5000.0, 0.42)) as problem:
+        made = prepare(
+            ReferenceModel(problem),
+            body.node_sets["tip"],
+            body.surfaces["observed"],
+            force_scale=expected_force(body, 5000.0),
+            smoothness=0.1,
+        )
+        found = made.register(cloud_on(body, truth, 500, rng, 5e-4))
+    assert found.judgement.verdict is verdict, found.judgement.reasons
+    if verdict is Verdict.DOUBTFUL:
+        assert any("its law is linear" in reason for reason in found.judgement.reasons)
