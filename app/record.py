@@ -121,6 +121,7 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "largest_correction_m": float(np.linalg.norm(result.correction, axis=1).max()),
         "pose": place.motion(result.pose.matrix).tolist(),
         "points": result.points,
+        "points_alike": result.alike,
         "outliers": result.outliers,
         "informed": result.informed,
         "iterations": len(result.trace),
@@ -214,8 +215,13 @@ def describe_estimate(estimate: Mapping[str, Any]) -> str:
     value, unit = estimate["value"], estimate["unit"]
     if unit == "m":
         value, low, high, unit = 1e3 * value, 1e3 * low, 1e3 * high, "mm"
-    text = f"{estimate['name']} {value:.4g}{' ' + unit if unit else ''} ({low:.4g} to {high:.4g})"
+    text = f"{estimate['name']} {_plain(value)}{' ' + unit if unit else ''} ({_plain(low)} to {_plain(high)})"
     return text if estimate["told"] > _TOLD else f"{text}, not told by the cloud"
+
+
+def _plain(value: float) -> str:
+    """Four digits, and no power of ten where a person would write none."""
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e8 else f"{value:.4g}"
 
 
 def millimetres(metres: float, digits: int = 2) -> str:

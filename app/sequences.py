@@ -17,7 +17,7 @@ from softtwin.meshes.embedding import carried, outer
 from softtwin.meshes.export import Coordinates
 
 from .pictures import CLOUD, ORGAN, Layer, Picture, Studio, camera_side, chart, inner_colours, view_of
-from .record import RECORD
+from .record import RECORD, describe_estimate
 
 Floats = NDArray[np.float64]
 Section = dict[str, Any]
@@ -63,6 +63,7 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
     return {
         "model": options["model"],
         "zone": options["zone"],
+        "known": options.get("forces") == "known",
         "frames": len(rows),
         "counts": record["counts"],
         "colours": _COLOURS,
@@ -70,6 +71,8 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
         "unlisted": len(rows) - len(shown),
         "targets": list(body.inner),
         "drafted": any("draft" in row for row in rows),
+        "estimates": lambda row: [describe_estimate(estimate) for estimate in row.get("estimates", ())],
+        "together": [describe_estimate(estimate) for estimate in record.get("together", ())],
         "bounded": next((row["network"]["confidence"] for row in rows if "network" in row), None),
         "pictures": _pictures(folder, body, place, rows, studio),
         "legend": [(ORGAN, "organ"), *((inner_colours(body.inner)[name], name) for name in body.inner)],

@@ -168,6 +168,7 @@ def make_registration(folder: Path, body: Body, frames: int = 4) -> None:
                 state=state,  # type: ignore[arg-type]
                 correction=np.zeros_like(shape),
                 doubt=1.0,
+                alike=1.0,
                 pose=Pose.identity(),
                 net_force=np.array([0.0, 0.3, 0.4]),
                 net_force_covariance=1e-4 * np.eye(3),
