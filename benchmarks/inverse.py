@@ -1,4 +1,4 @@
-"""The thesis's differentiable engine (section 7.2) on its beam: exact, and force, stiffness, Poisson's ratio as controls.
+"""The thesis's differentiable engine (section 7.2) on its beam: exactness; force, stiffness and ratio as controls.
 
     python benchmarks/inverse.py [--tables exactness force stiffness ratio sensitivity both]
 

@@ -26,6 +26,7 @@ from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import LinearResponse, create, write_block
+from softtwin.registration.conditions import Estimate
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registration
@@ -186,7 +187,11 @@ def make_registration(folder: Path, body: Body, frames: int = 4) -> None:
                 problem=None,  # type: ignore[arg-type]
                 posterior=None,  # type: ignore[arg-type]
             )
-            vars(result)["uncertainty"] = Uncertainty(1e-3 * np.ones((shape.size, 1)), np.zeros(len(shape)))
+            vars(result).update(
+                uncertainty=Uncertainty(1e-3 * np.ones((shape.size, 1)), np.zeros(len(shape))),
+                estimates=(Estimate("Young's modulus", "Pa", 4000.0, (3900.0, 12345.0), 0.3, 0.2),),
+                force_over_modulus=None,
+            )
             recorder.add(Frame(number, verdict, result, 0.1, body.points + shape), f"cloud_{number}.ply")
         recorder.add(Frame(frames, Judgement(Verdict.REFUSED, ("an empty cloud.",)), None, 0.0), "empty.ply")
 
@@ -282,6 +287,7 @@ def test_the_users_own_registrations_are_shown(page: Page) -> None:
     assert "5 frames with the surrogate, forces on all loaded nodes: 3 accepted, 2 refused." in text
     assert "Worst frame (1): refused, too <far>." in text
     assert "empty.ply" in text and "an empty cloud." in text
+    assert "Young's modulus 4000 Pa (3900 to 12345), not told by the cloud" in text
     assert [words.split(" frame")[0] for words in page.pictures() if " frame (" in words] == ["first", "worst", "last"]
     assert "surrogate: the surrogate gave up." in text and "most iterations" in text
 
