@@ -34,14 +34,13 @@ def inflation(feet: Floats, scaled: Floats, weights: Floats) -> float:
     if len(values) < _RINGS or square == 0.0 or extent == 0.0:
         return 1.0
     asked = np.arange(0, len(values), max(1, len(values) // _ASKED))
-    distances = cdist(places[asked], places)
-    products = values[asked, None] * values[None, :] / square
-    # Rings of equal area, so that each holds about as many points.
-    ring = np.floor(_RINGS * (distances / (_REACH * extent)) ** 2).astype(np.int64)
-    distances[np.arange(len(asked)), asked] = np.inf
-    inside = (ring < _RINGS) & np.isfinite(distances)
-    pairs = np.bincount(ring[inside], minlength=_RINGS)
-    sums = np.bincount(ring[inside], products[inside], minlength=_RINGS)
+    # Rings of equal area, so that each holds about as many points; the last is all that lies farther, or is itself.
+    squares = cdist(places[asked], places, "sqeuclidean") * (_RINGS / (_REACH * extent) ** 2)
+    squares[np.arange(len(asked)), asked] = _RINGS
+    ring = np.minimum(squares, _RINGS).astype(np.int64).ravel()
+    pairs = np.bincount(ring, minlength=_RINGS + 1)[:_RINGS]
+    products = np.outer(values[asked], values / square).ravel()
+    sums = np.bincount(ring, products, minlength=_RINGS + 1)[:_RINGS]
     correlated = sums > _SURE * np.sqrt(pairs)
     last = int(np.argmin(correlated)) if not correlated.all() else _RINGS  # up to the first that shares nothing
     return max(1.0, square * (1.0 + float(sums[:last].sum()) / len(asked)))
