@@ -1,10 +1,11 @@
-"""The tables of docs/results.md about registration, printed as Markdown from the records.
+"""The tables of docs/results.md, printed as Markdown from the records.
 
 python benchmarks/tables.py
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from liver import SEQUENCES
@@ -91,33 +92,69 @@ def with_deviation(spread: dict[str, float], scale: float, form: str) -> str:
     return f"{scale * spread['mean']:{form}} +- {scale * spread['std']:{form}}"
 
 
+def least_signal_to_noise(figures: dict[str, Any]) -> float:
+    """The smallest SNR of a split, decibels: that of its largest relative error, since older records hold no least."""
+    return -20.0 * math.log10(figures["relative_error"]["max"])
+
+
 def networks(name: str) -> None:
     """Networks: held-out errors, means +- deviations over the samples, and how sound the predictions are."""
     found = recorded(name)
     if not found:
         return
-    errors = ("e mm", "largest mm", "norm / nodes um", "relative % (95 %)", "SNR dB", "cosine", "Jacobian %")
-    head(name, *errors, "residual", "inside out; indefinite", "f(0) mm", "other loads: e mm", "steps; s")
+    sizes = ("u_2 m", "e mm", "largest mm", "norm / nodes um", "relative % (95 %)", "SNR dB; least")
+    derivatives = ("cosine", "Jacobian %")
+    sound_heads = ("residual", "inside out; indefinite", "f(0) mm")
+    head(name, *sizes, *derivatives, *sound_heads, "other loads: e; largest mm", "steps; s")
     for key, f in found.items():
         own = f[f["learned_from"]]
         sound, training = own["balance"], f["training"] or {}
-        other = [f[kind]["nodal_error"]["mean"] for kind in ("modal", "random") if kind in f and f[kind] is not own]
+        other = [f[kind] for kind in ("modal", "random") if kind in f and f[kind] is not own]
         residual = sound["residual"]
         row(
             key,
+            with_deviation(own["displacement_norm"], 1.0, ".2f" if own["displacement_norm"]["mean"] > 1.0 else ".3f"),
             with_deviation(own["nodal_error"], 1e3, ".3f"),
             with_deviation(own["largest_error"], 1e3, ".2f"),
             with_deviation(own["thesis_error"], 1e6, ".2f"),
             f"{100 * own['relative_error']['median']:.3f} ({100 * own['relative_error']['p95']:.2f})",
-            with_deviation(own["signal_to_noise"], 1.0, ".1f"),
+            f"{with_deviation(own['signal_to_noise'], 1.0, '.1f')}; {least_signal_to_noise(own):.1f}",
             f"{own['gradient_cosine']['mean']:.5f}",
             f"{100 * own['jacobian_error']['mean']:.1f}" if "jacobian_error" in own else "-",
             "-" if residual is None else f"{residual['median']:.2g}",
             f"{sound['inside_out']}; {sound['indefinite']} of {sound['samples']}",
             f"{1e3 * sound['at_rest']:.3f}",
-            f"{1e3 * other[0]:.3f}" if other else "-",
+            "; ".join(f"{1e3 * other[0][each]['mean']:.3f}" for each in ("nodal_error", "largest_error"))
+            if other
+            else "-",
             f"{training.get('steps', '-')}; {f['wall_s']:.0f}",
         )
+
+
+def prediction() -> None:
+    """What a prediction makes of its machine: shares of the operations and bytes a second of a large product."""
+    found = recorded("prediction")
+    if not found:
+        return
+    batches = list(next(iter(found["networks"].values()))["batches"])
+    head(
+        "prediction",
+        "weights, MB; operations, millions a sample",
+        *(f"{batch} at once: a second; % of operations; % of bytes (weights only)" for batch in batches),
+    )
+    for key, f in found["networks"].items():
+        row(
+            key,
+            f"{1e-6 * f['weights_bytes']:.1f}; {1e-6 * f['operations']:.0f}",
+            *(
+                f"{each['samples_per_s']:,.0f}; {100 * each['share_of_operations']:.0f}; "
+                f"{100 * each['share_of_bytes']:.1f}"
+                for each in f["batches"].values()
+            ),
+        )
+    peak = found["peak"]
+    print(f"\npeak of {found['device']}: {1e-9 * peak['operations_per_s']:.0f} billion operations and "
+          f"{1e-9 * peak['bytes_per_s']:.1f} GB a second")  # fmt: skip
 
 
 def hybrid() -> None:
@@ -233,6 +270,7 @@ def main() -> None:
     networks("networks_samples")
     networks("networks_physics")
     networks("networks_bodies")
+    prediction()
     hybrid()
     certificates()
     margins()
