@@ -261,6 +261,81 @@ def throughput() -> None:
         )
 
 
+_CONTROLS = {
+    "stiffness": ("modulus_off", "within_1e-8"),
+    "ratio": ("ratio_off", "within_1e-5"),
+    "both": ("modulus_off", "within_1e-5"),
+}
+
+
+def inverse() -> None:
+    """The thesis's section 7.2: what is off at the end, in the mean and at most."""
+    found = recorded("inverse")
+    if not found:
+        return
+    head(
+        "inverse", "loads", "as asked", "mean nodal m (largest)", "norm / nodes m", "control off, relative", "s a load"
+    )
+    if "exactness" in found:
+        f = found["exactness"]
+        away, share = f["distance"], f["share_within_1e-9"]
+        nodal, norm = away["mean"], away["norm_over_nodes"]["mean"]
+        spent = f["seconds_a_load"]["layer"]
+        row(
+            "exactness",
+            f["loads"],
+            f"{100 * share:.0f} % of nodes' largest",
+            f"{nodal['mean']:.1e} ({nodal['largest']:.1e})",
+            f"{norm:.1e}",
+            "-",
+            f"{spent:.2f}",
+        )
+    for name, (off, kept) in _CONTROLS.items():
+        f = found.get(name)
+        if f is not None:
+            each = f["found"]
+            row(
+                name,
+                f["loads"],
+                f[kept],
+                f"{each['mean']['mean']:.1e} ({each['mean']['largest']:.1e})",
+                f"{each['norm_over_nodes']['mean']:.1e}",
+                f"{each[off]['mean']:.1e} ({each[off]['largest']:.1e})",
+                f"{f['seconds']:.2f}",
+            )
+    if "force" in found:
+        f = found["force"]
+        for start, each in f["starts"].items():
+            row(
+                f"force from {start}",
+                f["loads"] // 2,
+                f"all but {len(f['failed'])} of {f['loads']}",
+                f"{each['mean']['mean']:.1e} ({each['mean']['largest']:.1e})",
+                f"{each['norm_over_nodes']['mean']:.1e}",
+                f"{each['force_off']['mean']:.1e} ({each['force_off']['largest']:.1e})",
+                f"{f['seconds']:.2f}",
+            )
+
+
+def misspecified() -> None:
+    """Doubt where the organ is not what the twin takes it for."""
+    found = recorded("misspecified")
+    if not found:
+        return
+    covered = "nodes covered by 50 / 90 / 95 % margins"
+    head("misspecified", "accepted; refused of", "error; predicted mm", covered, "inner", "force", "z rms", "median s")
+    for key, f in found.items():
+        if "error_mm" in f:
+            row(
+                key,
+                f"{100 * f['accepted']:.0f} %; {f['refused']} of {f['truths']}",
+                f"{f['error_mm']:.2f}; {f['predicted_mm']:.2f}",
+                *(" / ".join(f"{100 * s:.0f}" for s in f[part].values()) for part in ("nodes", "structures", "force")),
+                f"{f['z_rms']:.2f}",
+                f"{f['median_seconds']:.2f}",
+            )
+
+
 def main() -> None:
     for model in ("surrogate", "reference"):
         robustness(model)
@@ -276,6 +351,8 @@ def main() -> None:
     margins()
     active_rounds()
     throughput()
+    inverse()
+    misspecified()
 
 
 if __name__ == "__main__":
