@@ -444,6 +444,11 @@ class Conditions:
         return found
 
     @property
+    def has_modulus(self) -> bool:
+        """Whether Young's modulus of the whole body is among them."""
+        return any(isinstance(unknown, Stiffness) and unknown.cells is None for unknown in self.unknowns)
+
+    @property
     def has_forces_alone(self) -> bool:
         """Whether every forward model takes them."""
         return all(isinstance(unknown, Contact) for unknown in self.unknowns)

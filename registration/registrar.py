@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -284,8 +284,8 @@ class Registrar:
         conditions: unknowns beside the forces, which the model takes; none if not given.
         modulus_deviation: of the logarithm of Young's modulus, where this is no unknown: forces found are the more in
             doubt by it. Under nodal forces alone states depend on forces over stiffness, and are not.
-        anywhere: the same with forces anywhere: asked where neighbouring points are missed alike; None for forces that
-            act nowhere else.
+        anywhere: makes the same with forces anywhere, which is asked where neighbouring points are missed alike; None
+            for forces that act nowhere else.
 
     Raises:
         ValueError: conditions that the model does not take, or a negative deviation.
@@ -302,12 +302,14 @@ class Registrar:
         expectations: Expectations | None = None,
         conditions: Conditions | None = None,
         modulus_deviation: float = 0.0,
-        anywhere: Registrar | None = None,
+        anywhere: Callable[[], Registrar] | None = None,
     ) -> None:
         if not 0.0 <= modulus_deviation < np.inf:
             raise ValueError(f"Registrar.modulus_deviation: expected 0 or more, got {modulus_deviation}.")
         self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
-        self.conditions, self.modulus_deviation, self.anywhere = conditions, modulus_deviation, anywhere
+        is_found = conditions is not None and conditions.has_modulus
+        self.conditions, self.modulus_deviation = conditions, 0.0 if is_found else modulus_deviation
+        self.anywhere = None if anywhere is None else cache(anywhere)  # made when it is first asked for
         self.options = options or RegistrationOptions()
         discrepancy = model.discrepancy
         self.error = None if discrepancy is None else ModelError.of(discrepancy, observed.nodes)
@@ -322,6 +324,7 @@ class Registrar:
 
     def with_pose(self, pose: PosePrior, options: RegistrationOptions) -> Registrar:
         """The same with an unknown pose, and the options that suit it."""
+        anywhere = self.anywhere
         return Registrar(
             self.model,
             self.observed,
@@ -330,7 +333,7 @@ class Registrar:
             pose=pose,
             conditions=self.conditions,
             modulus_deviation=self.modulus_deviation,
-            anywhere=None if self.anywhere is None else self.anywhere.with_pose(pose, options),
+            anywhere=None if anywhere is None else lambda: anywhere().with_pose(pose, options),
         )
 
     def limited(self, until: float) -> Registrar:
@@ -338,7 +341,6 @@ class Registrar:
         other = copy.copy(self)
         other.options = replace(self.options, solver=replace(self.options.solver, until=until))
         other._thorough = replace(self._thorough, until=until)
-        other.anywhere = None if self.anywhere is None else self.anywhere.limited(until)
         return other
 
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
@@ -364,7 +366,7 @@ class Registrar:
         if not is_missed or time.monotonic() >= self.options.solver.until:
             return found
         with suppress(NotConverged):
-            other = self.anywhere.register(cloud)
+            other = self.anywhere().limited(self.options.solver.until).register(cloud)
             if other.judgement.is_usable and other.rms_distance < _EXPLAINED * found.rms_distance:
                 reason = (
                     f"forces outside the zone explain the cloud better: points lie {1e3 * found.rms_distance:.2f} mm "
@@ -673,9 +675,9 @@ def prepare(
         every = nodal_forces(model.body, carrying, scale, smoothness)
         rule = Informed(options.noise.least, scale=10.0 * force_scale, most=directions)
         forces = Prepared.of(model, observed, every, conditions).informed(observed, rule).forces
-    anywhere = None
-    if elsewhere is not None and nodes is not None:
-        anywhere = prepare(
+
+    def anywhere() -> Registrar:
+        return prepare(
             model,
             np.union1d(np.asarray(nodes, dtype=np.int64), np.asarray(elsewhere, dtype=np.int64)),
             triangles,
@@ -686,6 +688,7 @@ def prepare(
             pose=pose,
             conditions=conditions,
         )
+
     return Registrar(
         model,
         observed,
@@ -694,7 +697,7 @@ def prepare(
         pose=pose,
         conditions=conditions,
         modulus_deviation=modulus_deviation,
-        anywhere=anywhere,
+        anywhere=None if elsewhere is None or nodes is None else anywhere,
     )
 
 
