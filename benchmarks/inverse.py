@@ -99,14 +99,17 @@ def together(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
 
 
 def minimised(elastic: ElasticBody, forces: Floats, start: Floats, free: NDArray[np.bool_]) -> Floats:
-    """The state of least potential near a start, by torch's energy, forces and stiffness alone (Newton, SuperLU)."""
+    """The state of least potential near a start, by torch's energy, forces and stiffness alone (Newton, SuperLU).
+
+    A stiffness serves as long as steps shrink to a fifth.
+    """
     u, b = torch.from_numpy(start.copy())[None], torch.from_numpy(forces)[None]
-    value = float(elastic.potential(u, b))
-    for _ in range(60):
+    value, factor, last = float(elastic.potential(u, b)), None, np.inf
+    for _ in range(200):
         gap = (elastic.internal_forces(u) - b)[0].detach().numpy().ravel()
-        stiffness = elastic.stiffness(u[0]).tocsc()[free][:, free]
+        factor = factor or splu(elastic.stiffness(u[0]).tocsc()[free][:, free].tocsc())
         step = np.zeros_like(start).ravel()
-        step[free] = -splu(stiffness.tocsc()).solve(gap[free])
+        step[free] = -factor.solve(gap[free])
         length, way = 1.0, torch.from_numpy(step.reshape(1, -1, 3))
         while length > 1e-6:
             tried = float(elastic.potential(u + length * way, b))
@@ -114,8 +117,10 @@ def minimised(elastic: ElasticBody, forces: Floats, start: Floats, free: NDArray
                 break
             length *= 0.5
         u, value = u + length * way, tried
-        if np.abs(step).max() < 1e-9:  # the next would be its square
+        largest = float(np.abs(step).max())
+        if largest < 1e-13:
             break
+        factor, last = (None if largest > 0.2 * last else factor), largest
     return u[0].numpy()
 
 
