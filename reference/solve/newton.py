@@ -148,14 +148,7 @@ class Newton:
         self.tangent.factorisations = self.local_iterations = 0
         self.trace: list[Iteration] = []
 
-    def run(
-        self,
-        load: DiscreteLoad,
-        start: Floats,
-        factor: float = 1.0,
-        eliminate: bool = False,
-        most: int | None = None,
-    ) -> Attempt:
+    def run(self, load: DiscreteLoad, start: Floats, factor: float = 1.0, eliminate: bool = False) -> Attempt:
         """Iterate from a start whose held unknowns are where they should be.
 
         Args:
@@ -163,9 +156,7 @@ class Newton:
             start: unknowns to start from.
             factor: part of the full load that this is, for the trace.
             eliminate: balance few cells alone where a step is cut, a few times; then give up.
-            most: iterations, where fewer than usual are enough for a start to show what it is worth.
         """
-        self._most = self.options.max_iterations if most is None else min(most, self.options.max_iterations)
         self.tangent.suit(load)
         self._snes.setKSP(self.tangent.linear.ksp)
         self._load, self._factor = load, factor
@@ -233,7 +224,7 @@ class Newton:
             return reasons.CONVERGED_SNORM_RELATIVE
         if self._search_failed:
             return reasons.DIVERGED_LINE_SEARCH
-        return reasons.DIVERGED_MAX_IT if iteration >= self._most else reasons.ITERATING
+        return reasons.DIVERGED_MAX_IT if iteration >= self.options.max_iterations else reasons.ITERATING
 
     def _is_round_off(self, snes: Any) -> bool:
         """The residual falls no more, and what is left of it is the rounding of strains and of K u."""

@@ -26,7 +26,6 @@ from .system import System
 __all__ = ["Loading", "NewtonOptions", "Problem"]
 
 Floats = NDArray[np.float64]
-_PROPOSED = 12  # iterations: from a start that was worth proposing, half of them are enough
 _FIRST_STEP = 0.25  # of the load where the whole load has failed
 
 
@@ -167,8 +166,7 @@ class Problem:
         spent = 0
         if self.options.first_step == 1.0 or guess is not None or proposal is not None:
             for start in self._starts.candidates(wanted, guess, proposal, fallback):
-                most = _PROPOSED if start.name == "proposal" else None
-                attempt = self._newton.run(wanted, start.unknowns, eliminate=start.may_leave, most=most)
+                attempt = self._newton.run(wanted, start.unknowns, eliminate=start.may_leave)
                 spent += attempt.iterations
                 if attempt.converged and (start.name != "proposal" or self._is_lowest(attempt, wanted)):
                     found = replace(attempt, iterations=spent)
