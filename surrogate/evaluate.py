@@ -101,16 +101,17 @@ def evaluate(surrogate: Surrogate, data: DataSet, split: Split = "test", limit: 
 
     Args:
         surrogate: what to judge.
-        data: the data set, of the same body.
+        data: the data set, of the same body and, where both say which, of the same material.
         split: `train`, `validation` or `test`.
         limit: take the first so many draws only.
 
     Raises:
-        ValueError: another body, or no accepted sample.
+        ValueError: another body or material, or no accepted sample.
         DataSetError: the split is not complete.
     """
     if data.body.fingerprint != surrogate.body.fingerprint:
         raise ValueError(f"evaluate.data: {data.path} is of another body than the surrogate.")
+    _check_material(surrogate, data)
     samples = data.samples(split, limit)
     if len(samples) == 0:
         raise ValueError(f"evaluate.split: expected accepted samples in the {split} split of {data.path}, got none.")
@@ -132,6 +133,16 @@ def evaluate(surrogate: Surrogate, data: DataSet, split: Split = "test", limit: 
         prediction_ms=1e3 * float(np.median(times)),
         threads=os.environ.get("OPENBLAS_NUM_THREADS") or os.environ.get("OMP_NUM_THREADS") or "not limited",
     )
+
+
+def _check_material(surrogate: Surrogate, data: DataSet) -> None:
+    learned, plan = surrogate.learned_material or {}, data.header.get("plan", {})
+    differing = [name for name in learned if name in plan and plan[name] != learned[name]]
+    if differing:
+        here, there = (", ".join(f"{name} {values[name]}" for name in differing) for values in (plan, learned))
+        raise ValueError(
+            f"evaluate.data: expected the material that the surrogate has learned ({there}), got {here} in {data.path}."
+        )
 
 
 def _predict(surrogate: Surrogate, data: DataSet, samples: Samples) -> tuple[Floats, Floats, Floats]:

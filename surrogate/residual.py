@@ -21,7 +21,9 @@ from .algebra import TorchAlgebra
 class ElasticBody(nn.Module):
     """A body of one compressible material, its displacements in batches, (s, n, 3), metres.
 
-    The same cells, quadrature and energies as the reference's `Problem`; `to` moves it to a device or a precision.
+    Displacements and forces of another shape, or of another type than the body's own (float64 before `to`), are refused
+    with a ValueError. The same cells, quadrature and energies as the reference's `Problem`; `to` moves it to a device
+    or a precision.
 
     Args:
         body: the body, in space.
@@ -75,8 +77,17 @@ class ElasticBody(nn.Module):
                 )
             self.register_buffer(f"parameter_{name}", torch.from_numpy(values.reshape(-1, 1).copy()))
 
+    def _check(self, name: str, field: Tensor) -> None:
+        if not isinstance(field, Tensor):
+            raise ValueError(f"ElasticBody.{name}: expected a tensor, got {type(field).__name__}.")
+        if field.ndim != 3 or field.shape[1:] != (self.nodes, 3):
+            raise ValueError(f"ElasticBody.{name}: expected shape (s, {self.nodes}, 3), got {tuple(field.shape)}.")
+        if field.dtype != self.gradients.dtype:
+            raise ValueError(f"ElasticBody.{name}: expected {self.gradients.dtype}, got {field.dtype}; see `to`.")
+
     def deformation_gradients(self, displacement: Tensor) -> Tensor:
         """F at the points of the quadrature, (s, cells, q, 3, 3)."""
+        self._check("displacement", displacement)
         nodal = displacement[:, self.cells]
         unit = torch.eye(3, dtype=self.gradients.dtype, device=self.gradients.device)
         return unit + torch.einsum("scki,cqkj->scqij", nodal, self.gradients)
@@ -136,12 +147,14 @@ class ElasticBody(nn.Module):
             displacement: u, (s, n, 3), metres.
             forces: b, (s, n, 3), newtons.
         """
+        self._check("forces", forces)
         missing = (self.internal_forces(displacement) - forces) * self.free
         sizes = torch.linalg.vector_norm(forces * self.free, dim=(1, 2))
         return torch.linalg.vector_norm(missing, dim=(1, 2)) / sizes
 
     def potential(self, displacement: Tensor, forces: Tensor) -> Tensor:
         """Strain energy less the work of dead forces, (s,), joules: least in equilibrium."""
+        self._check("forces", forces)
         return self.energy(displacement) - (forces * displacement).sum(dim=(1, 2))
 
     def _density(self, F: Tensor) -> Tensor:

@@ -104,9 +104,15 @@ def checked_array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Float
     """Finite float64 values of one shape.
 
     Raises:
-        ValueError: another shape, NaN or infinity.
+        ValueError: no real numbers (text, complex ones, rows of different lengths), another shape, NaN or infinity.
     """
-    array = np.asarray(values, dtype=np.float64)
+    try:
+        given = np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"{name}: expected shape {shape}, got rows of different lengths.") from error
+    if given.dtype.kind not in "biuf":
+        raise ValueError(f"{name}: expected real numbers, got {given.dtype}.")
+    array = given.astype(np.float64, copy=False)
     if array.shape != shape:
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}.")
     if not np.isfinite(array).all():

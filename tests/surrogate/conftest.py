@@ -24,6 +24,7 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
+from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
 
 Floats = NDArray[np.float64]
@@ -68,8 +69,10 @@ class ClosedForm:
         return (corrected / (1.0 + GAMMA * energy)).reshape(-1, 3)
 
 
-def write_data_set(path: Path, body: Body, counts: dict[str, int] = COUNTS, poison: str = "") -> DataSet:
-    """A data set of the closed form; every fifth draw is rejected, the poisoned split holds NaN."""
+def write_data_set(
+    path: Path, body: Body, counts: dict[str, int] = COUNTS, poison: str = "", rejected: str = ""
+) -> DataSet:
+    """A data set of the closed form; every fifth draw is rejected, and a whole split, or NaN, where asked for."""
     truth = ClosedForm(body)
     loaded = np.setdiff1d(body.boundary_nodes, body.fixed)
     columns = truth.inverse[:, (3 * loaded[:, None] + np.arange(3)).ravel()]
@@ -82,6 +85,8 @@ def write_data_set(path: Path, body: Body, counts: dict[str, int] = COUNTS, pois
         if poison and block * BLOCK in data.split_draws(poison):  # type: ignore[arg-type]
             for name in ("forces", "displacements", "probes", "adjoints"):
                 arrays[name] = np.full_like(arrays[name], np.nan)
+        if rejected and block * BLOCK in data.split_draws(rejected):  # type: ignore[arg-type]
+            arrays["reason"] = np.full_like(arrays["reason"], Reason.UNSTABLE)
         write_block(path, block, arrays)
     return data
 
@@ -154,7 +159,12 @@ def umesh(data: DataSet) -> Surrogate:
     return train(data, TrainingPlan(UMesh(channels=8, levels=2), batch=16, epochs=10))
 
 
-@pytest.fixture(params=["reduced", "perceptron", "umesh"])
+@pytest.fixture(scope="session")
+def transolver(data: DataSet) -> Surrogate:
+    return train(data, TrainingPlan(Transolver(width=8, depth=1, heads=2, slices=4), batch=16, epochs=10))
+
+
+@pytest.fixture(params=["reduced", "perceptron", "umesh", "transolver"])
 def surrogate(request: pytest.FixtureRequest) -> Surrogate:
     model: Surrogate = request.getfixturevalue(request.param)
     return model

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -87,6 +89,27 @@ def test_a_surrogate_of_another_body_is_refused(reduced: Surrogate, data: DataSe
     other = Surrogate(beam((4, 2, 2), (0.4, 0.2, 0.3)), reduced.maps, reduced.network, reduced.card)
     with pytest.raises(ValueError, match="another body"):
         evaluate(other, data)
+
+
+def test_data_of_another_material_are_refused(
+    reduced: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = {**data.header["plan"], "material": "neo-hookean", "young_modulus": 5000.0, "poisson_ratio": 0.45}
+    learned = reduced.with_card(data={"plan": own})
+    for plan in (own, data.header["plan"]):  # the same, and a data set that does not say
+        monkeypatch.setitem(data.header, "plan", plan)
+        assert evaluate(learned, data).samples == 13
+    for change in ({"young_modulus": 4500.0}, {"poisson_ratio": 0.3}, {"material": "linear"}):
+        (name, value), *_ = change.items()
+        monkeypatch.setitem(data.header, "plan", {**own, **change})
+        message = rf"evaluate\.data: expected the material .* learned \({name} {own[name]}\), got {name} {value} in"
+        with pytest.raises(ValueError, match=message):
+            evaluate(learned, data)
+
+
+def test_a_split_without_accepted_samples_is_refused(reduced: Surrogate, make_data: Callable[..., DataSet]) -> None:
+    with pytest.raises(ValueError, match=r"evaluate\.split: expected accepted samples in the test split"):
+        evaluate(reduced, make_data(rejected="test"))
 
 
 def test_errors_of_the_jacobian_are_those_of_its_columns(reduced: Surrogate, data: DataSet) -> None:

@@ -56,6 +56,20 @@ def test_wrong_input_is_named(surrogate: Surrogate, loads: np.ndarray, monkeypat
         fast.linearised(np.full(3, np.nan))
     with pytest.raises(ValueError, match=r"FastSurrogate\.batch: expected a number of loads when it was built"):
         fast.solve_many(loads)
+    many = FastSurrogate(surrogate, "cpu", directions=3, batch=5)
+    ragged = [loads[0].tolist(), loads[1].tolist()[1:]]
+    for wrong, message in (
+        (loads[:4], r"expected shape \(5, 45, 3\), got \(4, 45, 3\)"),
+        (loads[0], r"expected shape \(5, 45, 3\), got \(45, 3\)"),
+        (loads.astype(str), r"expected real numbers, got <U\d+"),
+        (loads.astype(complex), "expected real numbers, got complex128"),
+        (loads.astype(object), "expected real numbers, got object"),
+        (None, "expected real numbers, got object"),
+        (ragged, r"expected shape \(5, 45, 3\), got rows of different lengths"),
+        (np.full_like(loads, np.inf), "expected finite numbers"),
+    ):
+        with pytest.raises(ValueError, match=rf"FastSurrogate\.forces: {message}"):
+            many.solve_many(wrong)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ValueError, match=r"FastSurrogate\.device: expected a GPU that torch can use, found none"):
         FastSurrogate(surrogate, "cuda")

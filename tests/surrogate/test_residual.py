@@ -148,3 +148,24 @@ def test_a_cell_inside_out_shows(rng) -> None:
 def test_what_is_no_batch_of_equilibria_is_refused(law: Material, weights: np.ndarray | None, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         ElasticBody(body_of("hexahedron"), law, weights)
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        (torch.zeros(36, 3, dtype=torch.float64), r"expected shape \(s, 36, 3\), got \(36, 3\)"),
+        (torch.zeros(2, 35, 3, dtype=torch.float64), r"expected shape \(s, 36, 3\), got \(2, 35, 3\)"),
+        (torch.zeros(2, 36, 2, dtype=torch.float64), r"expected shape \(s, 36, 3\), got \(2, 36, 2\)"),
+        (torch.zeros(2, 36, 3), r"expected torch\.float64, got torch\.float32"),
+        (torch.zeros(2, 36, 3, dtype=torch.complex128), r"expected torch\.float64, got torch\.complex128"),
+        (np.zeros((2, 36, 3)), "expected a tensor, got ndarray"),
+    ],
+)
+def test_a_batch_of_the_wrong_shape_or_type_is_refused(field: Tensor, message: str) -> None:
+    physics, rest = ElasticBody(body_of("hexahedron"), LAWS["Neo-Hookean"]), torch.zeros(2, 36, 3, dtype=torch.float64)
+    for ask in (physics.energy, physics.internal_forces, physics.jacobians):
+        with pytest.raises(ValueError, match=rf"ElasticBody\.displacement: {message}"):
+            ask(field)
+    for ask in (physics.residual, physics.potential):
+        with pytest.raises(ValueError, match=rf"ElasticBody\.forces: {message}"):
+            ask(rest, field)

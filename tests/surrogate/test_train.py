@@ -17,7 +17,7 @@ import torch
 from softtwin.reference.data.dataset import DataSet, DataSetError, drop_block
 from softtwin.surrogate import course as training
 from softtwin.surrogate.architecture import Architecture
-from softtwin.surrogate.checkpoint import CHECKPOINT, CheckpointError
+from softtwin.surrogate.checkpoint import CHECKPOINT, VERSION, CheckpointError
 from softtwin.surrogate.course import Course, Diverged, fit, rate_factor
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.mlp import Perceptron
@@ -242,6 +242,13 @@ def test_poisoned_training_data_is_noticed(make_data: Any, short: TrainingPlan) 
         train(make_data(poison="train"), short)
 
 
+@pytest.mark.parametrize("split", ["train", "validation"])
+def test_a_split_without_accepted_samples_is_refused(make_data: Any, short: TrainingPlan, split: str) -> None:
+    empty = make_data(rejected=split)
+    with pytest.raises(ValueError, match=rf"train\.data: expected accepted samples in the {split} split"):
+        train(empty, short)
+
+
 def test_an_incomplete_data_set_is_refused(make_data: Any, short: TrainingPlan) -> None:
     data = make_data()
     drop_block(data.path, 1)
@@ -271,10 +278,19 @@ def test_a_checkpoint_of_another_plan_is_refused(data: DataSet, short: TrainingP
         train(data, replace(short, architecture=Reduced(modes=6, width=16, depth=2), seed=3), tmp_path)
 
 
-def test_a_checkpoint_of_another_version_is_refused(data: DataSet, short: TrainingPlan, tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_architecture_is_refused(data: DataSet, short: TrainingPlan, tmp_path: Path) -> None:
+    train(data, short, tmp_path)
+    with pytest.raises(CheckpointError, match=r"another plan \(differs in architecture, "):
+        train(data, replace(short, architecture=Perceptron()), tmp_path)
+
+
+@pytest.mark.parametrize("version", [1, VERSION + 1])
+def test_a_checkpoint_of_another_version_is_refused(
+    data: DataSet, short: TrainingPlan, tmp_path: Path, version: int
+) -> None:
     train(data, short, tmp_path)
     checkpoint = torch.load(tmp_path / CHECKPOINT, weights_only=True)
-    checkpoint["course"]["version"] = 1
+    checkpoint["course"]["version"] = version
     torch.save(checkpoint, tmp_path / CHECKPOINT)
     with pytest.raises(CheckpointError, match="another version"):
         train(data, short, tmp_path)
