@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 from .checkpoint import VERSION
 from .plan import TrainingPlan
+from .precision import forbid_tf32, without_tf32
 
 ROUNDS = 40  # a round ends with a look at the validation split and a checkpoint
 _WARM_UP = 200  # steps over which the learning rate rises
@@ -140,6 +141,8 @@ class Course(lightning.LightningModule):
         """Only a process that was started to help takes a course from another: no advice of Lightning's there."""
         super().__setstate__(state)
         _hush()
+        if self.plan.precision == "single":
+            forbid_tf32()
 
     @property
     def share(self) -> float:
@@ -269,7 +272,7 @@ class _Progress(Callback):
 
 
 def fit(course: Course, path: Path, resume: bool, log: bool = False) -> None:
-    """Train to the end of the plan; every round leaves a checkpoint.
+    """Train to the end of the plan; every round leaves a checkpoint. In single precision a GPU multiplies without TF32.
 
     Args:
         course: what to train.
@@ -277,7 +280,7 @@ def fit(course: Course, path: Path, resume: bool, log: bool = False) -> None:
         resume: go on from it.
         log: leave a line for each round beside it, as CSV and for TensorBoard, in a folder of its own for each run.
     """
-    with _quiet(), _interruptible():
+    with _quiet(), _interruptible(), without_tf32(course.plan.precision == "single"):
         keeper = ModelCheckpoint(
             dirpath=path.parent,
             filename=path.stem,

@@ -6,8 +6,6 @@ They are captured by hand, since torch.compile loses forward-mode tangents (pyto
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Literal
 
 import numpy as np
@@ -19,6 +17,7 @@ from softtwin.reference.data.loading import checked_array
 
 from .export import Linearised, Value, leading_directions
 from .model import Surrogate
+from .precision import without_tf32
 
 Floats = NDArray[np.float64]
 Device = Literal["auto", "cpu", "cuda"]
@@ -103,12 +102,12 @@ class Captured:
         self._input = example.to("cuda")
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
-        with torch.no_grad(), _exact(), torch.cuda.stream(stream):
+        with torch.no_grad(), without_tf32(), torch.cuda.stream(stream):
             for _ in range(_WARM_UP):
                 self._run(self._input)
         torch.cuda.current_stream().wait_stream(stream)
         self._graph = torch.cuda.CUDAGraph()
-        with torch.no_grad(), _exact(), torch.cuda.graph(self._graph):
+        with torch.no_grad(), without_tf32(), torch.cuda.graph(self._graph):
             self._outputs = self._run(self._input)
         self._sent = torch.empty(example.shape, pin_memory=True)
         self._received = [torch.empty(output.shape, pin_memory=True) for output in self._outputs]
@@ -129,17 +128,6 @@ class Captured:
             host.copy_(output, non_blocking=True)
         torch.cuda.synchronize()
         return [host.numpy().copy() for host in self._received]
-
-
-@contextmanager
-def _exact() -> Iterator[None]:
-    """Without TF32, whose ten bits are too few."""
-    kept = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
-    try:
-        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
-        yield
-    finally:
-        torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = kept
 
 
 def _resolved(device: Device) -> str:

@@ -24,7 +24,8 @@ from .registry import ARCHITECTURES
 WEIGHTS = "surrogate.safetensors"
 CARD = "surrogate.json"
 FORMAT = 1
-_MAPS, _NETWORK = "frame.", "core."  # what their tensors' names begin with
+_MAPS, _NETWORK = "maps.", "core."  # what their tensors' names begin with
+_MAPS_BEFORE = "frame."  # of twins that were saved when that was their name
 NOTICE = "Research software, not a medical device: not for diagnosis or treatment."
 
 
@@ -80,7 +81,10 @@ def load(folder: Path | str, body: Body) -> Surrogate:
         )
     tensors = _read_weights(folder / WEIGHTS, card["weights"])
     maps: dict[str, Any] = {
-        name.removeprefix(_MAPS): array for name, array in tensors.items() if name.startswith(_MAPS)
+        name.removeprefix(prefix): array
+        for name, array in tensors.items()
+        for prefix in (_MAPS, _MAPS_BEFORE)
+        if name.startswith(prefix)
     }
     weights = {
         name.removeprefix(_NETWORK): torch.tensor(array) for name, array in tensors.items() if name.startswith(_NETWORK)

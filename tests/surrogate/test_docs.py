@@ -31,11 +31,15 @@ def test_the_guide_runs(data: DataSet, closed_form: Any, tmp_path: Path, capsys,
         "simulated_displacements": 1e3 * moved,
     }
     blocks = re.findall(r"```python\n(.*?)```", TEXT, flags=re.S)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     for block in blocks:
         exec(compile(block, "docs/surrogates.md", "exec"), names)
     assert "accepted test samples averaged" in capsys.readouterr().out
     np.testing.assert_array_equal(names["again"].solve(forces[0]).displacement, names["state"].displacement)
+    exact = names["again"].solve(forces[0]).displacement
+    for found in (names["single"], names["both"][0]):
+        np.testing.assert_allclose(found, exact, rtol=0.0, atol=1e-6 * np.abs(exact).max())
+    assert names["jacobian"].shape == (exact.size, 8)
     assert len(names["mine"].samples("train")) == 24
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
@@ -177,6 +180,18 @@ def test_a_loaded_surrogate_is_the_saved_one_bit_by_bit(
     assert np.array_equal(after.pull(forces), before.pull(forces))
     assert again.card["architecture"] == surrogate.card["architecture"]
     assert {path.name for path in (tmp_path / "twin").iterdir()} == {WEIGHTS, CARD}
+
+
+def test_maps_under_their_earlier_name_are_read(reduced: Surrogate, forces: np.ndarray, tmp_path: Path) -> None:
+    save(reduced, tmp_path)
+    tensors = load_file(tmp_path / WEIGHTS)
+    assert {name.split(".")[0] for name in tensors} == {"maps", "core"}
+    save_file({re.sub(r"^maps\.", "frame.", name): array for name, array in tensors.items()}, tmp_path / WEIGHTS)
+    card = json.loads((tmp_path / CARD).read_text())
+    card["weights"] = hashlib.sha256((tmp_path / WEIGHTS).read_bytes()).hexdigest()
+    (tmp_path / CARD).write_text(json.dumps(card))
+    again = load(tmp_path, reduced.body)
+    np.testing.assert_array_equal(again.solve(forces).displacement, reduced.solve(forces).displacement)
 
 
 def test_the_card_says_what_it_was_trained_on(reduced: Surrogate, data: DataSet, tmp_path: Path) -> None:

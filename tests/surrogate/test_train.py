@@ -23,6 +23,7 @@ from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.precision import without_tf32
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
 from softtwin.surrogate.transolver import Transolver
@@ -151,6 +152,24 @@ def test_mixed_precision_learns_too(data: DataSet) -> None:
     errors = [each.card["training"]["validation_error"] for each in (single, mixed)]
     assert errors[0] != errors[1] and errors[1] < 1.5 * errors[0]
     assert all(weights.dtype == np.float64 for weights in _weights(mixed).values() if weights.dtype.kind == "f")
+
+
+@pytest.mark.parametrize(("precision", "allowed"), [("single", False), ("mixed", True)])
+def test_single_precision_is_without_tf32(
+    data: DataSet, short: TrainingPlan, monkeypatch: pytest.MonkeyPatch, precision: Any, allowed: bool
+) -> None:
+    seen, step = set(), Course.training_step
+
+    def looking(course: Course, batch: Any, number: int) -> Any:
+        seen.add((torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32))
+        return step(course, batch, number)
+
+    monkeypatch.setattr(Course, "training_step", looking)
+    with without_tf32(False):  # it brings back what was
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
+        train(data, replace(short, precision=precision))
+        assert seen == {(allowed, allowed)}
+        assert torch.backends.cuda.matmul.allow_tf32 and torch.backends.cudnn.allow_tf32
 
 
 @pytest.mark.parametrize("budget", ["epochs", "seconds"])
