@@ -23,7 +23,8 @@ from .registry import ARCHITECTURES
 
 WEIGHTS = "surrogate.safetensors"
 CARD = "surrogate.json"
-FORMAT = 1
+FORMAT = 2
+_READ = (1, FORMAT)
 _MAPS, _NETWORK = "maps.", "core."  # what their tensors' names begin with
 _MAPS_BEFORE = "frame."  # of twins that were saved when that was their name
 NOTICE = "Research software, not a medical device: not for diagnosis or treatment."
@@ -101,7 +102,7 @@ def _read_card(path: Path) -> dict[str, Any]:
         raise TwinError(f"load.folder: expected a twin with {path.name} in {path.parent}, found none.") from error
     except (ValueError, OSError) as error:
         raise TwinError(f"load.folder: {path} cannot be read ({error}); is it truncated?") from error
-    if not isinstance(card, dict) or card.get("format") != FORMAT:
+    if not isinstance(card, dict) or card.get("format") not in _READ:
         raise TwinError(f"load.folder: expected a card of format {FORMAT} in {path}.")
     missing = [name for name in ("architecture", "body", "weights") if name not in card]
     if missing or card["architecture"] not in ARCHITECTURES:

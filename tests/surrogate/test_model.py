@@ -188,7 +188,7 @@ def test_maps_under_their_earlier_name_are_read(reduced: Surrogate, forces: np.n
     assert {name.split(".")[0] for name in tensors} == {"maps", "core"}
     save_file({re.sub(r"^maps\.", "frame.", name): array for name, array in tensors.items()}, tmp_path / WEIGHTS)
     card = json.loads((tmp_path / CARD).read_text())
-    card["weights"] = hashlib.sha256((tmp_path / WEIGHTS).read_bytes()).hexdigest()
+    card |= {"weights": hashlib.sha256((tmp_path / WEIGHTS).read_bytes()).hexdigest(), "format": 1}
     (tmp_path / CARD).write_text(json.dumps(card))
     again = load(tmp_path, reduced.body)
     np.testing.assert_array_equal(again.solve(forces).displacement, reduced.solve(forces).displacement)
@@ -243,7 +243,7 @@ def test_damaged_weights_are_refused(reduced: Surrogate, tmp_path: Path, damage:
     ("edit", "message"),
     [
         (lambda text: text[: len(text) // 2], "truncated"),
-        (lambda text: text.replace('"format": 1', '"format": 99'), "card of format 1"),
+        (lambda text: text.replace('"format": 1', '"format": 99'), "card of format 2"),
         (lambda text: text.replace('"weights"', '"heights"'), "lacks"),
         (lambda text: text.replace('"architecture": "reduced"', '"architecture": "oracle"', 1), "known architecture"),
     ],
