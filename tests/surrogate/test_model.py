@@ -243,7 +243,7 @@ def test_damaged_weights_are_refused(reduced: Surrogate, tmp_path: Path, damage:
     ("edit", "message"),
     [
         (lambda text: text[: len(text) // 2], "truncated"),
-        (lambda text: text.replace('"format": 1', '"format": 99'), "card of format 2"),
+        (lambda text: text.replace('"format": 2', '"format": 99'), "card of format 2"),
         (lambda text: text.replace('"weights"', '"heights"'), "lacks"),
         (lambda text: text.replace('"architecture": "reduced"', '"architecture": "oracle"', 1), "known architecture"),
     ],
