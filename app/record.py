@@ -195,7 +195,9 @@ def describe(row: Mapping[str, Any]) -> str:
         return line
     force, doubt = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
     line += f", cloud to surface {millimetres(row['rms_distance_m'])}"
-    line += f", net force {force:.3f} ± {doubt:.3f} N" if doubt > 0.0 else ""  # none where all forces are known
+    line += (
+        f", net force {force:.3f} ± {doubt:.3f} N" if force > 0.0 or doubt > 0.0 else ""
+    )  # none where all forces are known
     line += "".join(f", {describe_estimate(estimate)}" for estimate in row.get("estimates", ()))
     line += f", {1e3 * row['seconds']:.0f} ms"
     if "age_s" in row:

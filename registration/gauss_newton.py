@@ -308,17 +308,16 @@ class LocalModel:
         self.deviations = np.hypot(self.noise, left_out)
         residuals = problem.residuals(trial, self.own)
         self.weights = loss.weight(residuals / self.deviations)
-        self.shared = 1.0 / problem.alike
         self.precision = np.ones(problem.size)
         self.precision[problem.force_part] = 1.0 / self.scales.force**2
-        trusted = (np.sqrt(self.shared * self.weights) / self.deviations)[:, None] * self.jacobian
+        trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
         self.information = trusted.T @ trusted
         self._hessian = self.information + np.diag(self.precision)
         self.gradient = self._gradient(residuals, self.weights)
         self.value = self.objective(trial, loss)
 
     def _gradient(self, residuals: Floats, weights: Floats) -> Floats:
-        by_distances = self.shared * weights * residuals / self.deviations**2
+        by_distances = weights * residuals / self.deviations**2
         return by_distances @ self.jacobian + self.precision * self.trial.coefficients
 
     def _found_scales(self, loss: Loss, noise: float, left_out: Floats, graduation: float) -> tuple[Scales, bool]:
@@ -327,7 +326,7 @@ class LocalModel:
         beside = self.jacobian[:, part.stop :], self.trial.coefficients[part.stop :]
         coefficients, residuals = self.trial.coefficients[part], problem.residuals(self.trial, self.own)
         deviations = np.hypot(noise, left_out)
-        weights = loss.weight(residuals / deviations) / problem.alike
+        weights = loss.weight(residuals / deviations)
         shares = (noise / deviations) ** 2
         jacobian = self.jacobian[:, part]
         local = linearised(jacobian, residuals, weights, coefficients, loss.consistency, noise, beside, shares)
@@ -374,7 +373,7 @@ class LocalModel:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ trial.coefficients**2)
         scaled = self.problem.residuals(trial, self.own) / self.deviations
-        return self.shared * float(loss.value(scaled).sum()) + prior
+        return float(loss.value(scaled).sum()) + prior
 
     @property
     def length(self) -> float:
@@ -410,10 +409,14 @@ class LocalModel:
         """Largest predicted movement of an observed node, metres."""
         return float(self.problem.moved(self.trial, change).max())
 
-    def posterior(self) -> Posterior:
-        """Laplace's approximation at the trial."""
+    def posterior(self, alike: float = 1.0) -> Posterior:
+        """Laplace's approximation at the trial.
+
+        Args:
+            alike: so many points tell what one would that errs by itself.
+        """
         count = self.problem.forces.size
-        return posterior(self.information, self.precision, self.trial.coefficients, self.scales, count)
+        return posterior(self.information / alike, self.precision, self.trial.coefficients, self.scales, count)
 
     def alike(self) -> float:
         """How many points tell what one would that errs by itself, as the residuals here have it; see `inflation`."""

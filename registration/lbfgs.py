@@ -154,5 +154,5 @@ class _Run:
 def _objective(problem: Problem, trial: Trial, loss: Loss, local: LocalModel) -> tuple[float, Floats]:
     """Robust distances and their gradient by the coefficients, (k,), at the scales of a model."""
     scaled = problem.residuals(trial, local.own) / local.deviations
-    slope = local.shared * loss.weight(scaled) * scaled / local.deviations
-    return local.shared * float(loss.value(scaled).sum()), problem.pulled(trial, slope)
+    slope = loss.weight(scaled) * scaled / local.deviations
+    return float(loss.value(scaled).sum()), problem.pulled(trial, slope)

@@ -55,7 +55,6 @@ class Problem:
         noise: what is believed of the standard deviation of a point's distance, metres.
         error: what the model may get wrong; None where it is not known in patterns.
         conditions: unknowns beside the forces, which the model takes; None where there are none.
-        alike: so many points tell what one would that errs by itself.
     """
 
     model: ReducedModel
@@ -66,7 +65,6 @@ class Problem:
     noise: Scale
     error: ModelError | None = None
     conditions: Conditions | None = None
-    alike: float = 1.0
 
     @property
     def size(self) -> int:

@@ -45,7 +45,6 @@ _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
 _DOUBTS, _SURE = 3, 0.1  # times that the model's error is scaled anew; not where that changes it by less
 _MISSED, _EXPLAINED = 1.0, 0.5  # times the least noise, shared by neighbours; part of it that forces anywhere leave
-_SHARES, _AS_MANY = 4, 0.3  # times that it is asked how many points err alike; not where that changes it by less
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
 _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
@@ -382,7 +381,6 @@ class Registrar:
         if start is None:
             return self._cold(points, begin)
         problem = self._problem(points, start.prepared, start.trial, start.doubt)
-        problem = replace(problem, alike=start.alike)
         near = problem.begun(start.trial.coefficients.copy(), start.trial)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
             found = self._from_rest(points, start.prepared, self._thorough)
@@ -391,7 +389,6 @@ class Registrar:
             solver = self.options.solver.following()
             found = solver.solve(problem, near.coefficients, near)
             problem, found, doubt = self._doubted(problem, found, start.doubt, solver)
-            problem, found = self._shared(problem, found, solver)
             result = self._result(problem, found, start.prepared, begin, doubt)
         if start.prepared is not self._everywhere and self._has_left(result, start):
             return self._cold(points, begin)
@@ -507,8 +504,6 @@ class Registrar:
             found = _after(found, solver.solve(problem, found.trial.coefficients, found.trial))
         if self.error is not None and not is_hopeless:
             problem, found, doubt = self._doubted(problem, found, doubt, self.options.solver.following())
-        if not is_hopeless:
-            problem, found = self._shared(problem, found, solver.following())
         return self._result(problem, found, believed, begin, doubt)
 
     def _believed(self, prepared: Prepared, found: Found) -> Prepared:
@@ -549,21 +544,6 @@ class Registrar:
             found = _after(found, again)
         return problem, found, doubt
 
-    def _shared(self, problem: Problem, found: Found, solver: GaussNewton | LBFGS) -> tuple[Problem, Found]:
-        """Once more where neighbouring points err alike: together they tell less than they are many.
-
-        Noise of a camera, stiffness and meshes that are wrong leave what whole patches share; forces would explain it.
-        """
-        for _ in range(_SHARES):
-            if not found.outcome.is_success:
-                break
-            alike = found.local.alike()
-            if abs(np.log(alike / problem.alike)) < _AS_MANY:
-                break
-            problem = replace(problem, alike=alike)
-            found = _after(found, solver.last().solve(problem, found.trial.coefficients, found.trial))
-        return problem, found
-
     def _gathered(self, nodal: Floats) -> Prepared:
         """The unknown forces once more, where forces were found."""
         body = self.model.body
@@ -595,6 +575,8 @@ class Registrar:
         return check_cloud(points, self.model.body)
 
     def _result(self, problem: Problem, found: Found, prepared: Prepared, begin: float, doubt: float) -> Registration:
+        alike = found.local.alike()
+        found = replace(found, posterior=found.local.posterior(alike))
         trial, net = found.trial, problem.net_forces(found.trial)
         nodal = problem.nodal_forces(trial)
         total = nodal.sum(axis=0)
@@ -608,7 +590,7 @@ class Registrar:
             state=state,
             correction=problem.correction(trial),
             doubt=doubt,
-            alike=problem.alike,
+            alike=alike,
             pose=trial.pose or Pose.identity(),
             net_force=total,
             net_force_covariance=covariance,
