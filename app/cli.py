@@ -41,6 +41,18 @@ _PROCESSES = click.option(
 )
 
 
+def _known_loads(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options for what is known to act."""
+    options = (
+        click.option("--known-forces", type=_EXISTING, help="Known nodal forces that act along: .npy (n, 3), newtons."),
+        click.option("--gravity", type=float, nargs=3, help="That acts beyond what the body has at rest, m/s^2."),
+        click.option("--pressure", type=float, help="On the whole boundary, pascals, following it."),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(package_name="softtwin")
 def softtwin() -> None:
@@ -222,9 +234,7 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
     help="Unknown beside the forces: young-modulus, young-modulus@TUMOUR, poisson-ratio, moved@ZONE, contact; "
     "=DEVIATION behind it (may be repeated).",
 )
-@click.option("--known-forces", type=_EXISTING, help="Known nodal forces that act along: .npy (n, 3), newtons.")
-@click.option("--gravity", type=float, nargs=3, help="That acts beyond what the body has at rest, m/s^2.")
-@click.option("--pressure", type=float, help="On the whole boundary, pascals, following it.")
+@_known_loads
 @click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")
 @click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
 @click.option("--align", type=click.Choice(["auto"]), help="Look for the pose in the first cloud that shows it.")
@@ -309,9 +319,7 @@ def register(
     help="What is to be found: young-modulus, young-modulus@TUMOUR, poisson-ratio, moved@ZONE; =DEVIATION behind it "
     "(may be repeated).",
 )
-@click.option("--known-forces", type=_EXISTING, help="Known nodal forces: .npy (n, 3), newtons.")
-@click.option("--gravity", type=float, nargs=3, help="That acts beyond what the body has at rest, m/s^2.")
-@click.option("--pressure", type=float, help="On the whole boundary, pascals, following it.")
+@_known_loads
 @click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
 @click.option("--noise", type=float, help="Noise of a point, metres, that the search for it begins with.")
 @click.option("--noise-known", is_flag=True, default=None, help="Hold the noise at --noise instead of finding it.")

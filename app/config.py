@@ -240,19 +240,20 @@ class RegistrationSection(_Section):
     @model_validator(mode="after")
     def _unknowns_can_be_found(self) -> RegistrationSection:
         kinds = [Unknown.parse(text).kind for text in self.unknowns]
-        known = self.known_forces or any(self.gravity) or self.pressure
+        others = set(kinds) - {"contact"}
         if "contact" in kinds and len(kinds) > 1:
             raise ValueError(f"registration.unknowns: expected contact alone, got {', '.join(self.unknowns)}")
-        if self.model != "reference" and (known or set(kinds) - {"contact"}):
-            allowed = "reference" if known or "moved" in kinds else "reference or hybrid"
-            if not (self.model == "hybrid" and allowed == "reference or hybrid"):
-                raise ValueError(
-                    f"registration.model: expected {allowed} with unknowns beside the forces or known loads (a network "
-                    f"has learned one material, one support and forces alone), got {self.model}"
-                )
-        if self.model == "hybrid" and "contact" in kinds:
-            raise ValueError("registration.model: expected surrogate or reference with a contact, got hybrid")
-        if self.forces == "known" and not set(kinds) - {"contact"}:
+        models = ["surrogate", "reference"] if kinds and not others else ["surrogate", "reference", "hybrid"]
+        if others:  # a network has learned one material
+            models = ["reference", "hybrid"]
+        if self.known_forces or any(self.gravity) or self.pressure or "moved" in kinds:  # one support, and forces alone
+            models = ["reference"]
+        if self.model not in models:
+            raise ValueError(
+                f"registration.model: expected {' or '.join(models)} with these unknowns and known loads (a network "
+                f"has learned one material, one support and forces alone), got {self.model}"
+            )
+        if self.forces == "known" and not others:
             raise ValueError(
                 "registration.unknowns: expected at least one (young-modulus, poisson-ratio, moved@NODES) where all "
                 "forces are known, got none"

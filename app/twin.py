@@ -21,6 +21,7 @@ from softtwin.meshes.files import read_body
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import loaded_nodes
 from softtwin.registration.conditions import Conditions
+from softtwin.registration.contact import ContactRegistrar
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.hybrid import HybridRegistrar
@@ -36,7 +37,6 @@ from softtwin.registration.registrar import (
     prepare,
 )
 from softtwin.registration.rigid import align
-from softtwin.registration.single import ContactRegistrar
 from softtwin.registration.thinning import thinned
 from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Judgement, Verdict

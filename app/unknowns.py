@@ -15,7 +15,7 @@ from softtwin.meshes.export import Coordinates
 from softtwin.meshes.signed import cells_inside
 from softtwin.reference.data.loading import Loading
 from softtwin.registration.conditions import Condition, Conditions, Moved, PoissonRatio, Stiffness
-from softtwin.registration.single import Patch
+from softtwin.registration.contact import Patch
 
 if TYPE_CHECKING:
     from .config import Config
@@ -120,16 +120,6 @@ class Scenario:
             section.pressure,
             config.material.density,
         )
-
-    @property
-    def has_loads(self) -> bool:
-        """Whether anything is known to act."""
-        return self.forces is not None or any(self.gravity) or self.pressure != 0.0
-
-    @property
-    def wants_reference(self) -> bool:
-        """Whether a network that has learned one material, one support and forces alone is not enough."""
-        return self.has_loads or any(unknown.kind != "contact" for unknown in self.unknowns)
 
     @property
     def patch(self) -> Patch | None:

@@ -53,6 +53,10 @@ class Condition(Protocol):
     """One unknown: coefficients of unit variance to a part of the inputs."""
 
     @property
+    def is_force(self) -> bool:
+        """Whether nodal forces are all that it changes: every forward model takes those."""
+
+    @property
     def count(self) -> int:
         """Number of coefficients."""
 
@@ -91,7 +95,12 @@ class Stiffness:
     name: str = ""
 
     def __post_init__(self) -> None:
-        _check_deviation("Stiffness", self.deviation)
+        check_deviation("Stiffness", self.deviation)
+
+    @property
+    def is_force(self) -> bool:
+        """False."""
+        return False
 
     @property
     def count(self) -> int:
@@ -126,29 +135,28 @@ class Stiffness:
         return [Change(parameters={"young_modulus": self._there(np.zeros(len(body.cells)), slope)})]
 
     def estimates(self, inputs: Inputs, mean: Floats, covariance: Floats) -> list[Estimate]:
-        """Young's modulus, pascals, were there no other unknown of stiffness; of several moduli, the mean of theirs."""
-        return [self.estimate(inputs, self.deviation * mean[0], self.deviation**2 * covariance[0, 0], covariance, mean)]
+        """Young's modulus, pascals; of several moduli, the mean of theirs."""
+        name = f"Young's modulus of {self.name}" if self.name else "Young's modulus"
+        at = self._grown(inputs)
+        return [estimate(name, "Pa", lambda c: at(self.deviation * c), mean[0], covariance[0, 0])]
 
-    def estimate(self, inputs: Inputs, grown: float, variance: float, covariance: Floats, mean: Floats) -> Estimate:
-        """The modulus for a change of its logarithm, whose own coefficient's law says what was told.
+    def beside(self, found: Estimate, inputs: Inputs, grown: float, variance: float) -> Estimate:
+        """A region's estimate where the body's modulus is unknown, too: both have their part in it.
 
         Args:
+            found: its own.
             inputs: at all coefficients' medians beforehand.
-            grown: logarithm by which the modulus has grown.
+            grown: logarithm by which both make the modulus grow.
             variance: of that.
-            covariance: of the unknown's own coefficient, (1, 1).
-            mean: of it, (1,).
         """
+        both = estimate(found.name, found.unit, self._grown(inputs), grown, variance)
+        return replace(found, value=both.value, interval=both.interval)
+
+    def _grown(self, inputs: Inputs) -> Callable[[float], float]:
+        """The modulus as a function of the logarithm by which it grows."""
         median = np.asarray(inputs.parameters["young_modulus"])
         chosen = median if self.cells is None or not median.ndim else median[self.cells]
-
-        def at(change: float) -> float:
-            return float(np.mean(LEAST_MODULUS + (chosen - LEAST_MODULUS) * np.exp(change)))
-
-        name = f"Young's modulus of {self.name}" if self.name else "Young's modulus"
-        found = _estimate(name, "Pa", at, grown, variance)
-        own = _estimate(name, "Pa", at, mean[0], covariance[0, 0])
-        return replace(found, told=own.told, deviations=own.deviations)
+        return lambda change: float(np.mean(LEAST_MODULUS + (chosen - LEAST_MODULUS) * np.exp(change)))
 
 
 @dataclass(frozen=True)
@@ -162,7 +170,12 @@ class PoissonRatio:
     deviation: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_deviation("PoissonRatio", self.deviation)
+        check_deviation("PoissonRatio", self.deviation)
+
+    @property
+    def is_force(self) -> bool:
+        """False."""
+        return False
 
     @property
     def count(self) -> int:
@@ -198,7 +211,7 @@ class PoissonRatio:
         def at(coefficient: float) -> float:
             return float(self._ratio(median, coefficient))
 
-        return [_estimate("Poisson's ratio", "", at, mean[0], covariance[0, 0])]
+        return [estimate("Poisson's ratio", "", at, mean[0], covariance[0, 0])]
 
 
 @dataclass(frozen=True)
@@ -216,8 +229,13 @@ class Moved:
     shift: float = 0.01
 
     def __post_init__(self) -> None:
-        _check_deviation("Moved.turn", self.turn)
-        _check_deviation("Moved.shift", self.shift)
+        check_deviation("Moved.turn", self.turn)
+        check_deviation("Moved.shift", self.shift)
+
+    @property
+    def is_force(self) -> bool:
+        """False."""
+        return False
 
     @property
     def count(self) -> int:
@@ -263,84 +281,7 @@ class Moved:
                 return scale * c
 
             name = f"{kind} of {self.name} {'about' if kind == 'turn' else 'along'} {axis}"
-            found.append(_estimate(name, unit, at, mean[place], covariance[place, place]))
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class Contact:
-    """One force spread over a patch of unknown place: its share at a node falls off as a normal law with distance.
-
-    Args:
-        nodes: that the patch may touch, (a,).
-        place: where its middle is expected, (3,), metres, at rest.
-        reach: standard deviation of that along each axis, metres.
-        radius: of the patch, metres: deviation of the share's law.
-        force: standard deviation of each component of the force, newtons.
-    """
-
-    nodes: Ints
-    place: Floats
-    reach: float
-    radius: float
-    force: float
-
-    def __post_init__(self) -> None:
-        for name in ("reach", "radius", "force"):
-            _check_deviation(f"Contact.{name}", getattr(self, name))
-        if len(self.nodes) == 0:
-            raise ValueError("Contact.nodes: expected at least one node that may be touched, got none.")
-
-    @property
-    def count(self) -> int:
-        """6: place and force."""
-        return 6
-
-    @property
-    def strides(self) -> Floats:
-        """Largest changes of the coefficients in one step: twice the patch; forces are held by how far nodes move."""
-        return np.repeat([2.0 * self.radius / self.reach, np.inf], 3)
-
-    def _shares(self, coefficients: Floats, body: Body) -> tuple[Floats, Floats]:
-        """Share of the force at each node, (a,), and its derivative by the place, (a, 3), 1/metre."""
-        arms = body.points[self.nodes] - (self.place + self.reach * coefficients[:3])
-        exponents = -0.5 * np.einsum("ai,ai->a", arms, arms) / self.radius**2
-        shares = np.exp(exponents - exponents.max())
-        shares /= shares.sum()
-        return shares, shares[:, None] * (arms - shares @ arms) / self.radius**2
-
-    def taken(self, inputs: Inputs, coefficients: Floats, body: Body) -> Inputs:
-        """The inputs with the force at coefficients."""
-        forces = np.zeros_like(body.points) if inputs.forces is None else inputs.forces.copy()
-        shares, _ = self._shares(coefficients, body)
-        forces[self.nodes] += shares[:, None] * (self.force * coefficients[3:])
-        return replace(inputs, forces=forces)
-
-    def changes(self, inputs: Inputs, coefficients: Floats, body: Body) -> list[Change]:
-        """Derivative of the nodal forces by each coefficient, (n, 3)."""
-        shares, slopes = self._shares(coefficients, body)
-        columns = [self.reach * slope[:, None] * (self.force * coefficients[3:]) for slope in slopes.T]
-        columns += [shares[:, None] * (self.force * axis) for axis in np.eye(3)]
-        found = []
-        for column in columns:
-            whole = np.zeros_like(body.points)
-            whole[self.nodes] = column
-            found.append(Change(forces=whole))
-        return found
-
-    def estimates(self, inputs: Inputs, mean: Floats, covariance: Floats) -> list[Estimate]:
-        """Place of the patch's middle at rest, metres, and force, newtons."""
-        found = []
-        for place, (kind, axis) in enumerate((kind, axis) for kind in ("place", "force") for axis in range(3)):
-            middle, scale = (self.place[axis], self.reach) if kind == "place" else (0.0, self.force)
-            unit = "m" if kind == "place" else "N"
-
-            def at(c: float, middle: float = middle, scale: float = scale) -> float:
-                return float(middle + scale * c)
-
-            found.append(
-                _estimate(f"{kind} of the contact along {'xyz'[axis]}", unit, at, mean[place], covariance[place, place])
-            )
+            found.append(estimate(name, unit, at, mean[place], covariance[place, place]))
         return found
 
 
@@ -444,14 +385,19 @@ class Conditions:
         return found
 
     @property
-    def has_modulus(self) -> bool:
-        """Whether Young's modulus of the whole body is among them."""
-        return any(isinstance(unknown, Stiffness) and unknown.cells is None for unknown in self.unknowns)
+    def modulus(self) -> tuple[int, float] | None:
+        """Place and deviation of the coefficient of the whole body's Young's modulus; None where that is no unknown."""
+        begin = 0
+        for unknown in self.unknowns:
+            if isinstance(unknown, Stiffness) and unknown.cells is None:
+                return begin, unknown.deviation
+            begin += unknown.count
+        return None
 
     @property
     def has_forces_alone(self) -> bool:
         """Whether every forward model takes them."""
-        return all(isinstance(unknown, Contact) for unknown in self.unknowns)
+        return all(unknown.is_force for unknown in self.unknowns)
 
     def forces(self, coefficients: Floats) -> Floats:
         """Nodal forces among the inputs, (n, 3), newtons."""
@@ -476,26 +422,18 @@ class Conditions:
             mean: coefficients found, (count,).
             covariance: of theirs, (count, count).
         """
-        found, begin = list[Estimate](), 0
+        found, begin, modulus = list[Estimate](), 0, self.modulus
         for unknown, part in self._parts(mean):
             own = slice(begin, begin + unknown.count)
-            if isinstance(unknown, Stiffness):
-                along = self._growth(begin, unknown)
+            each = unknown.estimates(self.expected, part, covariance[own, own])
+            if isinstance(unknown, Stiffness) and modulus is not None and unknown.cells is not None:
+                along = np.zeros(self.count)
+                along[begin], along[modulus[0]] = unknown.deviation, modulus[1]
                 law = float(along @ mean), float(along @ covariance @ along)
-                found.append(unknown.estimate(self.expected, *law, covariance[own, own], part))
-            else:
-                found += unknown.estimates(self.expected, part, covariance[own, own])
+                each = [unknown.beside(each[0], self.expected, *law)]
+            found += each
             begin = own.stop
         return tuple(found)
-
-    def _growth(self, place: int, unknown: Stiffness) -> Floats:
-        """Derivative of the logarithm of a region's modulus by all coefficients: the body's own change included."""
-        along, begin = np.zeros(self.count), 0
-        for other in self.unknowns:
-            if isinstance(other, Stiffness) and (begin == place or other.cells is None):
-                along[begin] = other.deviation
-            begin += other.count
-        return along
 
 
 def _with(inputs: Inputs, **parameters: Parameter) -> Inputs:
@@ -506,7 +444,12 @@ def _name(unknown: Condition) -> str:
     return f"{type(unknown).__name__} {getattr(unknown, 'name', '')}".strip()
 
 
-def _check_deviation(name: str, value: float) -> None:
+def check_deviation(name: str, value: float) -> None:
+    """Refuse a prior without width, or without end.
+
+    Raises:
+        ValueError: the value is not positive and finite.
+    """
     if not 0.0 < value < np.inf:
         raise ValueError(
             f"{name}: expected a positive deviation, got {value}; without a prior, forces and stiffness cannot be told "
@@ -514,7 +457,16 @@ def _check_deviation(name: str, value: float) -> None:
         )
 
 
-def _estimate(name: str, unit: str, at: Callable[[float], float], mean: float, variance: float) -> Estimate:
+def estimate(name: str, unit: str, at: Callable[[float], float], mean: float, variance: float) -> Estimate:
+    """What a normal law of a coefficient says of a growing function of it.
+
+    Args:
+        name: of the unknown.
+        unit: of its values.
+        at: from the coefficient to the value.
+        mean: of the coefficient, whose variance beforehand is 1.
+        variance: of it.
+    """
     reach = _DEVIATIONS * np.sqrt(max(variance, 0.0))
     told = float(np.clip(1.0 - variance, 0.0, 1.0))
     return Estimate(name, unit, at(mean), (at(mean - reach), at(mean + reach)), told, float(abs(mean)))

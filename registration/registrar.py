@@ -18,7 +18,7 @@ from softtwin.meshes.clouds import check_cloud
 from softtwin.meshes.metrics import edge_lengths
 from softtwin.reference.data.outcome import NotConverged
 
-from .conditions import Conditions, Estimate, Stiffness
+from .conditions import Conditions, Estimate
 from .evidence import Scale
 from .forward import ForwardModel, ReducedModel, State, reduce_model
 from .gauss_newton import Found, GaussNewton, Step
@@ -243,20 +243,15 @@ class Registration:
         It is all that a state under nodal forces and fixed supports depends on. None where the modulus is no unknown.
         """
         conditions, problem = self.problem.conditions, self.problem
-        if conditions is None:
+        unknown = None if conditions is None else conditions.modulus
+        if conditions is None or unknown is None:
             return None
-        begin = problem.condition_part.start
-        for unknown in conditions.unknowns:
-            if isinstance(unknown, Stiffness) and unknown.cells is None:
-                break
-            begin += unknown.count
-        else:
-            return None
+        place, deviation = problem.condition_part.start + unknown[0], unknown[1]
         modulus = float(
             np.mean(conditions.inputs(self.coefficients[problem.condition_part]).parameters["young_modulus"])
         )
         slopes = problem.net_forces(self.trial) / modulus
-        slopes[:, begin] -= unknown.deviation * self.net_force / modulus
+        slopes[:, place] -= deviation * self.net_force / modulus
         covariance = self.posterior.net_force_covariance(slopes, problem.forces.left_out / modulus**2)
         return self.net_force / modulus, np.sqrt(np.diag(covariance))
 
@@ -306,7 +301,7 @@ class Registrar:
         if not 0.0 <= modulus_deviation < np.inf:
             raise ValueError(f"Registrar.modulus_deviation: expected 0 or more, got {modulus_deviation}.")
         self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
-        is_found = conditions is not None and conditions.has_modulus
+        is_found = conditions is not None and conditions.modulus is not None
         self.conditions, self.modulus_deviation = conditions, 0.0 if is_found else modulus_deviation
         self.anywhere = None if anywhere is None else cache(anywhere)  # made when it is first asked for
         self.options = options or RegistrationOptions()

@@ -129,9 +129,9 @@ def test_bad_unknowns(folder: Path, tmp_path: Path, words: list[str], message: s
 
 
 def test_a_network_takes_no_other_stiffness() -> None:
-    with pytest.raises(ConfigError, match=r"registration\.model: expected reference or hybrid with unknowns"):
+    with pytest.raises(ConfigError, match=r"registration\.model: expected reference or hybrid with these unknowns"):
         parse_config({"registration": {"unknowns": ["young-modulus"]}})
-    with pytest.raises(ConfigError, match=r"registration\.model: expected reference with unknowns"):
+    with pytest.raises(ConfigError, match=r"registration\.model: expected reference with these unknowns"):
         parse_config({"registration": {"model": "hybrid", "gravity": [0.0, 0.0, -9.81]}})
     parse_config({"registration": {"unknowns": ["contact"]}})
 

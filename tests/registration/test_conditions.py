@@ -13,10 +13,10 @@ from softtwin.meshes.body import Body
 from softtwin.reference.data.inputs import Change, Inputs
 from softtwin.reference.data.loading import Loading
 from softtwin.reference.data.materials import NeoHookean
-from softtwin.registration.conditions import Conditions, Contact, Moved, PoissonRatio, Stiffness
+from softtwin.registration.conditions import Conditions, Moved, PoissonRatio, Stiffness
+from softtwin.registration.contact import Contact, ContactRegistrar, Patch
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import expected_force, prepare
-from softtwin.registration.single import ContactRegistrar, Patch
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
