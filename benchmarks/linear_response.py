@@ -3,8 +3,9 @@
     python benchmarks/linear_response.py [--bodies liver-grid phantom]
 
 On the real liver's sparse grid and on the tetrahedra of the phantom: relative errors of the displacement at rest under
-held-out drawn loads, smooth forces within 4 cm, and forces of random sign at every node. Then what the loose corners of
-nearly empty cells do, and what a Jacobian of 64 modes costs beside its equilibrium (the beam of 304 hexahedra).
+held-out drawn loads, smooth forces within 4 cm, and forces of random sign at every node. Then how many ranks the whole
+response needs to within a share of its largest singular value, what the loose corners of nearly empty cells do, and
+what a Jacobian of 64 modes costs beside its equilibrium (the beam of 304 hexahedra).
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ KNOWN, HELD_OUT = 512, 40
 NEAR, SMOOTH = 0.04, 0.02  # metres: extent of a smooth force, correlation within it
 NEARLY_EMPTY = (1e-3, 0.1)
 PULL = 0.05  # newtons
+SHARES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  # of the largest singular value
 
 
 def smooth_forces(positions: Floats, rng: np.random.Generator) -> Floats:
@@ -67,6 +69,18 @@ def missed(body: Body, plan: LoadPlan) -> dict[str, Any]:
                 relative = np.linalg.norm(off, axis=1) / np.linalg.norm(exact, axis=1)
                 found[f"{kind}, {name}"] = {"median": float(np.median(relative)), "max": float(relative.max())}
     return found
+
+
+def ranks(body: Body, plan: LoadPlan) -> dict[str, int]:
+    """How many singular values of the whole response are larger than a share of the largest."""
+    loaded = loaded_nodes(body, plan)
+    unknowns = (3 * loaded[:, None] + np.arange(3)).ravel()
+    columns = np.zeros((body.points.size, len(unknowns)))
+    columns[unknowns, np.arange(len(unknowns))] = 1.0
+    with Problem(body, NeoHookean(5000.0, 0.45)) as problem:
+        values = np.linalg.svd(problem.apply_inverse(columns), compute_uv=False)
+    counted = {f"{share:g}": int((values > share * values[0]).sum()) for share in SHARES}
+    return {"loaded_unknowns": len(unknowns), **counted}
 
 
 def loose_corners() -> dict[str, Any]:
@@ -118,9 +132,10 @@ def main() -> None:
         figures[name] = missed(bodies[name](), PLANS[name])
         print(name, {k: v if isinstance(v, int) else f"{100 * v['median']:.3g} ({100 * v['max']:.3g}) %"
                      for k, v in figures[name].items()}, flush=True)  # fmt: skip
+    figures["ranks"] = {"beam": ranks(beam(), LoadPlan()), "phantom": ranks(liver_phantom(), PLANS["phantom"])}
     figures["loose corners"] = loose_corners()
     figures["cost on the beam"] = jacobian_cost()
-    print(figures["loose corners"], figures["cost on the beam"])
+    print(figures["ranks"], figures["loose corners"], figures["cost on the beam"])
     write("linear_response", figures)
 
 

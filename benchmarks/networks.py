@@ -3,6 +3,8 @@
     python benchmarks/networks.py [--tables 4.2 physics ...] [--ranks 2] [--train 8192] [--seconds 200]
     python benchmarks/networks.py --tables thesis --data FOLDER --device cuda [--epochs 100] [--channels 128]
 
+The second asks for torch alone, and takes any data set (`networks_bodies.py` makes those of other bodies).
+
 Makes the data of the beam of 304 hexahedra under benchmarks/runs/ where they are not there (under mpirun; goes on where
 it was stopped). Each row is one training, judged on held-out samples of its own and of the other distribution, and is
 written as it is finished; the same command goes on with the rows that are missing.
@@ -13,7 +15,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,6 +30,7 @@ from softtwin.app.chain import prepare
 from softtwin.app.config import Config
 from softtwin.app.launch import generate_in_parallel
 from softtwin.app.stages.mesh import mesh_stage
+from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples, existing
 from softtwin.reference.data.jacobians import missing_jacobians
 from softtwin.surrogate.architecture import Architecture, Network
@@ -147,10 +150,15 @@ def rows(tables: list[str], train_count: int, seconds: float) -> Iterator[Row]:
             count *= 2
 
 
-def thesis_rows(architectures: Iterable[Architecture], epochs: int, device: Device) -> Iterator[Row]:
-    """The thesis's budget, for a GPU: all samples, so many epochs; U-Mesh in mixed precision, too."""
+def thesis_rows(architectures: Iterable[Architecture], body: Body, epochs: int, device: Device) -> Iterator[Row]:
+    """The thesis's budget, for a GPU: all samples, so many epochs; U-Mesh in mixed precision, too, or not at all."""
     for architecture in architectures:
         name = architecture.name
+        try:
+            architecture.check(body)
+        except ValueError as error:
+            print(f"thesis: {name}: left out: {error}")
+            continue
         size = f", {architecture.channels} channels" if isinstance(architecture, UMesh) else ""
         plan = TrainingPlan(architecture, epochs=epochs, device=device)
         yield Row("thesis", f"{name}{size}, {epochs} epochs", plan)
@@ -263,7 +271,8 @@ def show(key: str, figures: dict[str, Any]) -> None:
     print("; ".join(parts), flush=True)
 
 
-def main() -> None:
+def main(given: Sequence[str] | None = None) -> None:
+    """Make the rows that are asked for, by the command line or by these words."""
     parser = argparse.ArgumentParser(description=__doc__)
     tables = ["4.1", "4.2", "4.5", "physics", "samples", "thesis"]
     parser.add_argument("--tables", nargs="+", default=["4.2"], choices=tables)
@@ -272,13 +281,16 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=200.0)
     parser.add_argument("--data-seed", type=int, default=0, help="other data, that nothing was chosen on")
     parser.add_argument("--own-alone", action="store_true", help="leave the other distribution out")
-    parser.add_argument("--data", type=Path, help="modal data that are there, where FEniCSx is not")
+    parser.add_argument("--data", type=Path, help="data that are there, where FEniCSx is not; `modal` in the record")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"], help="of the table thesis")
     parser.add_argument("--channels", type=int, default=128, help="of U-Mesh in the table thesis")
+    parser.add_argument(
+        "--width", type=int, help="of the perceptron in the table thesis; the displacement's if not said"
+    )
     parser.add_argument("--epochs", type=int, default=EPOCHS, help="of the table thesis")
     parser.add_argument("--only", default="", help="rows that have this in their name")
     parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(given)
     held_out = {"validation": 256, "test": 512}
     counts = {"train": arguments.train, **held_out}
     ranks, seed = arguments.ranks, arguments.data_seed
@@ -290,8 +302,8 @@ def main() -> None:
     with reference(data["modal"]) as problem:
         wanted = list(rows(arguments.tables, arguments.train, arguments.seconds))
         if "thesis" in arguments.tables:
-            kinds = (Reduced(), Perceptron(), UMesh(arguments.channels), Transolver())
-            wanted += thesis_rows(kinds, arguments.epochs, arguments.device)
+            kinds = (Reduced(), Perceptron(arguments.width), UMesh(arguments.channels), Transolver())
+            wanted += thesis_rows(kinds, data["modal"].body, arguments.epochs, arguments.device)
         for row in wanted:
             if arguments.only not in row.key:
                 continue

@@ -1,11 +1,17 @@
 """The tables of docs/results.md, printed as Markdown from the records.
 
-python benchmarks/tables.py
+    python benchmarks/tables.py [--into docs/results.md]
+
+With `--into` each table of that page whose first heading is one of these is replaced.
 """
 
 from __future__ import annotations
 
+import argparse
+import io
 import math
+from contextlib import redirect_stdout
+from pathlib import Path
 from typing import Any
 
 from liver import SEQUENCES
@@ -136,6 +142,24 @@ def prediction() -> None:
     found = recorded("prediction")
     if not found:
         return
+    head(
+        "prediction, ms",
+        "double",
+        "single",
+        "with Jacobian",
+        "onnxruntime: value; with Jacobian",
+        "256 at once, a second",
+    )
+    for key, f in found["networks"].items():
+        graphs = ("onnxruntime_ms", "onnxruntime_with_jacobian_ms")
+        row(
+            key,
+            f"{f['double_ms']:.2f}",
+            f"{f['single_ms']:.2f}",
+            f"{f['with_jacobian_ms']:.1f}",
+            "; ".join(f"{f[name]:.2f}" for name in graphs if name in f) or "-",
+            f"{f['batches']['256']['samples_per_s']:,.0f}",
+        )
     batches = list(next(iter(found["networks"].values()))["batches"])
     head(
         "prediction",
@@ -336,7 +360,8 @@ def misspecified() -> None:
             )
 
 
-def main() -> None:
+def print_all() -> None:
+    """All tables, with a line on what stands in none."""
     for model in ("surrogate", "reference"):
         robustness(model)
     sequences("registration_reference_default_facets")
@@ -353,6 +378,40 @@ def main() -> None:
     throughput()
     inverse()
     misspecified()
+
+
+def tables_of(text: str) -> dict[str, list[str]]:
+    """The lines of each table of a page, by its first heading."""
+    found: dict[str, list[str]] = {}
+    lines: list[str] = []
+    for line in [*text.splitlines(), ""]:
+        if line.startswith("|"):
+            lines.append(line)
+        elif lines:
+            found[lines[0].split("|")[1].strip()] = lines
+            lines = []
+    return found
+
+
+def replaced(page: str, printed: str) -> str:
+    """A page with each of its tables that are printed, too, as it is printed."""
+    wanted = tables_of(printed)
+    for heading, lines in tables_of(page).items():
+        if heading in wanted:
+            page = page.replace("\n".join(lines), "\n".join(wanted[heading]))
+    return page
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--into", type=Path, help="a page whose tables are brought up to date")
+    page = parser.parse_args().into
+    with redirect_stdout(io.StringIO()) as printed:
+        print_all()
+    if page is None:
+        print(printed.getvalue(), end="")
+    else:
+        page.write_text(replaced(page.read_text(), printed.getvalue()))
 
 
 if __name__ == "__main__":

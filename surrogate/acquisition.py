@@ -13,6 +13,7 @@ from .signs import SignReader
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _SHORT_LIST = 4  # times as many loads as are wanted, those least in balance, are spread out
+_AS_DRAWN = 0.5  # of those that are taken: a network that learns from ever more extremes gets the others wrong
 _LEAST_SPREAD = 1e-3  # of the largest: a direction hardly ever loaded must not tell loads apart
 
 
@@ -21,7 +22,8 @@ def most_telling(surrogate: Surrogate, candidates: Iterable[Floats], wanted: int
 
     Of the loads whose predictions have the longest linear step to balance (`Signs.step`; one that is inside out counts
     as infinitely far) those are taken that lie far from what is known and from each other in the network's
-    coordinates (farthest-point sampling, Gonzalez 1985).
+    coordinates (farthest-point sampling, Gonzalez 1985). Every second one is the next candidate as they come, so that
+    what is learned keeps to how loads are drawn.
 
     Args:
         surrogate: trained on what is known; its card names the material.
@@ -30,7 +32,7 @@ def most_telling(surrogate: Surrogate, candidates: Iterable[Floats], wanted: int
         known: forces at the loaded nodes that were learned, (s, l, 3), newtons.
 
     Returns:
-        Places among the candidates, (wanted,), the most telling first.
+        Places among the candidates, (wanted,), the most telling first, with those as they come between them.
 
     Raises:
         CalibrationError: the card does not name a material that torch knows.
@@ -45,12 +47,16 @@ def most_telling(surrogate: Surrogate, candidates: Iterable[Floats], wanted: int
         coordinates.append(surrogate.maps.encoded(ramp[worst].ravel()[surrogate.rows]))
     if len(steps) < wanted:
         raise ValueError(f"most_telling.candidates: expected at least {wanted}, got {len(steps)}.")
-    short = np.argsort(-np.asarray(steps), kind="stable")[: _SHORT_LIST * wanted]
+    telling = wanted - int(_AS_DRAWN * wanted)
+    short = np.argsort(-np.asarray(steps), kind="stable")[: _SHORT_LIST * telling]
     learned = surrogate.maps.encoded(known.reshape(len(known), -1).T).T
     spread = np.sqrt((learned**2).mean(axis=0))
     spread = np.maximum(spread, _LEAST_SPREAD * spread.max())
-    places = spread_out(np.stack(coordinates)[short] / spread, wanted, learned / spread)
-    return np.asarray(short[places])
+    told = short[spread_out(np.stack(coordinates)[short] / spread, telling, learned / spread)]
+    drawn = np.setdiff1d(np.arange(len(steps)), told)[: wanted - telling]
+    taken = np.empty(wanted, dtype=np.int64)
+    taken[::2], taken[1::2] = told, drawn
+    return taken
 
 
 def spread_out(points: Floats, wanted: int, taken: Floats) -> Ints:

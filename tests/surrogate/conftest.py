@@ -132,6 +132,14 @@ def data(small_beam: Body, tmp_path_factory: pytest.TempPathFactory) -> DataSet:
 
 
 @pytest.fixture
+def soft(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> DataSet:
+    same = DataSet(data.path)
+    material = {"material": "neo-hookean", "young_modulus": 20.0, "poisson_ratio": 0.4}
+    monkeypatch.setitem(same.header, "plan", {**same.header["plan"], **material})
+    return same
+
+
+@pytest.fixture
 def make_data(small_beam: Body, tmp_path: Path) -> Maker:
     def make(**options: Any) -> DataSet:
         return write_data_set(tmp_path / "data.zarr", small_beam, **options)

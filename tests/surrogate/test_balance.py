@@ -15,14 +15,6 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.residual import ElasticBody
 
 
-@pytest.fixture
-def soft(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> DataSet:
-    same = DataSet(data.path)
-    material = {"material": "neo-hookean", "young_modulus": 20.0, "poisson_ratio": 0.4}
-    monkeypatch.setitem(same.header, "plan", {**same.header["plan"], **material})
-    return same
-
-
 def test_figures_are_those_of_each_prediction(surrogate: Surrogate, soft: DataSet) -> None:
     body, samples = ElasticBody(soft.body, soft.material), soft.samples("test")
     forces, found = predictions(surrogate, soft, samples)
