@@ -14,11 +14,13 @@ from softtwin.surrogate.plan import Device
 
 from .config import Config, ConfigError, to_toml
 from .inputs import changes, load_plan, mesh_inputs, plan_entries, solved_data
-from .launch import generate_in_parallel
+from .launch import doubt_in_parallel, generate_in_parallel
 from .register import NOTICE
+from .stages.doubt import is_current
 from .stages.generate import describe_data, lacks_jacobians
 from .stages.learn import train_stage, training_plan, validate_stage
 from .stages.mesh import mesh_stage
+from .twin import DOUBT
 from .workspace import Workspace, open_workspace, write_whole
 
 Say = Callable[[str], None]
@@ -84,22 +86,24 @@ def make_twin(
         ConfigError: equilibria were solved there on another mesh.
     """
     plan = training_plan(space.config.training, device, processes)  # refused before the hour that equilibria take
-    say(f"1/4 mesh: {space.config.body.source}")
+    say(f"1/5 mesh: {space.config.body.source}")
     body = _mesh(space, say)
     say(f"    {len(body.points)} nodes, {len(body.cells)} cells, {len(body.fixed)} fixed, {1e3 * body.volume:.2f} l")
     check_loads(body, load_plan(space.config))
     plan.architecture.check(body)
     say(_indented((space.folder / "mesh_quality.txt").read_text()))
-    say("2/4 generate: eigenmodes, modal loads, equilibria")
+    say("2/5 generate: eigenmodes, modal loads, equilibria")
     _generate(space, body, path, say, again)
-    say("3/4 train: the surrogate")
+    say("3/5 train: the surrogate")
     try:
         train_stage(space, device=device, processes=processes)
     except CheckpointError as error:
         say(f"    from the start: {str(error).partition(';')[0].removeprefix('train.folder: ')}")
         train_stage(space, fresh=True, device=device, processes=processes)
-    say("4/4 validate: held-out errors")
+    say("4/5 validate: held-out errors")
     say(validate_stage(space))
+    say("5/5 doubt: what the organ may be otherwise")
+    _doubt(space, path, say)
 
 
 def _mesh(space: Workspace, say: Say) -> Body:
@@ -125,6 +129,16 @@ def _generate(space: Workspace, body: Body, path: Path, say: Say, again: bool) -
         say(f"    there already: {describe_data(data)}")
         return
     generate_in_parallel(path, space.config.samples.ranks, again)  # says itself what it has made
+
+
+def _doubt(space: Workspace, path: Path, say: Say) -> None:
+    if not space.config.doubt.draws or not (space.config.doubt.attachment or space.config.doubt.poisson_ratio):
+        (space.twin / DOUBT).unlink(missing_ok=True)
+        say("    nothing: [doubt] names none, and margins know of none")
+    elif is_current(space, DataSet(space.data)):
+        say("    there already")
+    else:
+        doubt_in_parallel(path, space.config.samples.ranks)
 
 
 def _refuse_changes(space: Workspace, data: DataSet) -> None:

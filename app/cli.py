@@ -191,6 +191,20 @@ def validate(configuration: Path) -> None:
 
 
 @softtwin.command()
+@click.argument("configuration", type=_EXISTING)
+def doubt(configuration: Path) -> None:
+    """Solve what CONFIGURATION's organ may be otherwise ([doubt]): margins know of it; also under `mpirun -n N`.
+
+    What holds the organ may lie elsewhere, or its Poisson's ratio be another. Goes on where it was stopped.
+    """
+    from .stages.doubt import doubt_stage
+
+    found = doubt_stage(configuration)
+    if found is not None:
+        click.echo(f"    {found}")
+
+
+@softtwin.command()
 @click.argument("twin", type=_EXISTING)
 @click.option("--output", type=_PATH, help="Folder to write; TWIN/onnx if not given.")
 @click.option("--directions", default=64, show_default=True, type=click.IntRange(1), help="Of force in the Jacobian.")

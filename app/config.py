@@ -198,6 +198,21 @@ class TrainingSection(_Section):
     )
 
 
+class DoubtSection(_Section):
+    """What the organ may be otherwise than its twin: `softtwin doubt` draws alternatives, and margins know of them."""
+
+    draws: int = Field(96, ge=0, description="alternatives that are drawn, one under a training load each; 0: none")
+    attachment: float = Field(
+        0.004,
+        ge=0.0,
+        description="how far what holds the organ may lie elsewhere on it: standard deviation along each axis, metres",
+    )
+    poisson_ratio: tuple[float, float] | tuple[()] = Field(
+        (), description="least and largest Poisson's ratio that the organ may have; empty: the material's"
+    )
+    seed: int = Field(0, ge=0, description="seed of the draws")
+
+
 class RegistrationSection(_Section):
     """From a cloud to forces."""
 
@@ -271,6 +286,7 @@ class Config(_Section):
     samples: SamplesSection = SamplesSection()
     solver: SolverSection = SolverSection()
     training: TrainingSection = TrainingSection()
+    doubt: DoubtSection = DoubtSection()
     registration: RegistrationSection = RegistrationSection()
 
     @property

@@ -78,6 +78,11 @@ def train_inputs(space: Workspace, data: DataSet) -> dict[str, Any]:
     return {"body.vtu": _sha256(space.body), "data set": data.identity, **training}
 
 
+def doubt_inputs(space: Workspace, data: DataSet) -> dict[str, Any]:
+    """Entries of [doubt] and the identity of the data set."""
+    return {"data set": data.identity, **dict(_flat("doubt", space.config.doubt.model_dump()))}
+
+
 def validate_inputs(space: Workspace, data: DataSet) -> dict[str, Any]:
     """The twin's weights and the identity of the data set."""
     return {"weights": _sha256(space.twin / "surrogate.safetensors"), "data set": data.identity}

@@ -6,11 +6,15 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+
+import click
 
 from softtwin.reference.ranks import FailedElsewhere
 
 from .doctor import available_cores
+from .stages.doubt import doubt_stage
 from .stages.generate import generate_stage
 
 REFUSED = 2  # exit code of a command whose message was printed
@@ -29,10 +33,26 @@ def generate_in_parallel(config_path: Path, ranks: int, again: bool = False) -> 
         FailedElsewhere: the stage was refused; its own message stands above.
         RuntimeError: it ended in another way.
     """
+    if not _in_parallel(["generate", str(config_path), *(["--again"] if again else [])], ranks):
+        generate_stage(config_path, again=again)
+
+
+def doubt_in_parallel(config_path: Path, ranks: int) -> None:
+    """Run the stage of doubt under mpirun, or here where there is one core or no mpirun; as `generate_in_parallel`.
+
+    Args:
+        config_path: the configuration file.
+        ranks: MPI ranks; 0 for one a core.
+    """
+    if not _in_parallel(["doubt", str(config_path)], ranks):
+        click.echo(f"    {doubt_stage(config_path)}")
+
+
+def _in_parallel(words: Sequence[str], ranks: int) -> bool:
+    """Run a command of softtwin under mpirun; False, and nothing was done, where that is of no use."""
     ranks = ranks or available_cores()
     if ranks == 1 or shutil.which("mpirun") is None:
-        generate_stage(config_path, again=again)
-        return
+        return False
     # A caller that runs MPI itself hands down the names of its own job, which mpirun would take for its.
     environment = {name: value for name, value in os.environ.items() if not name.startswith(_JOB_VARIABLES)}
     environment["OPENBLAS_NUM_THREADS"] = "1"
@@ -40,14 +60,14 @@ def generate_in_parallel(config_path: Path, ranks: int, again: bool = False) -> 
         environment["SOFTTWIN_PROGRESS"] = "1"
     if os.geteuid() == 0:
         environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-    program = [sys.executable, "-m", "softtwin.app.cli", "generate", str(config_path)]
-    program += ["--again"] if again else []
+    program = [sys.executable, "-m", "softtwin.app.cli", *words]
     command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), *program]
     done = subprocess.run(command, env=environment, check=False)
     if done.returncode == REFUSED:
-        raise FailedElsewhere(f"generate: refused by the ranks for {config_path}; their message stands above.")
+        raise FailedElsewhere(f"{words[0]}: refused by the ranks for {words[1]}; their message stands above.")
     if done.returncode != 0:
         raise RuntimeError(
-            f"generate: mpirun ended with code {done.returncode}; its message stands above. What was solved is kept: "
-            f"run `softtwin generate {config_path}` again to go on."
+            f"{words[0]}: mpirun ended with code {done.returncode}; its message stands above. What was solved is kept: "
+            f"run `softtwin {words[0]} {words[1]}` again to go on."
         )
+    return True

@@ -95,6 +95,7 @@ def _header(twin: Twin, zone: str | None) -> dict[str, Any]:
         "body": twin.body.fingerprint,
         "files_in": {"unit": place.unit, "axes": place.axes},
         "options": options,
+        **({"doubt": dict(twin.otherwise)} if twin.otherwise else {}),
     }
 
 

@@ -70,6 +70,7 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
         "rows": shown,
         "unlisted": len(rows) - len(shown),
         "targets": list(body.inner),
+        "doubt": _otherwise(record.get("doubt", {})),
         "drafted": any("draft" in row for row in rows),
         "estimates": lambda row: [describe_estimate(estimate) for estimate in row.get("estimates", ())],
         "together": [describe_estimate(estimate) for estimate in record.get("together", ())],
@@ -81,6 +82,17 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
         if len(rows) > 1
         else None,
     }
+
+
+def _otherwise(asked: Mapping[str, Any]) -> str:
+    """What margins know that the organ may be otherwise, in words; none where they know of nothing."""
+    words = []
+    if asked.get("attachment"):
+        words.append(f"an attachment that lies elsewhere by some {1e3 * asked['attachment']:.1f} mm along each axis")
+    if asked.get("poisson_ratio"):
+        least, largest = asked["poisson_ratio"]
+        words.append(f"a Poisson's ratio of {least:g} to {largest:g}")
+    return " and ".join(words)
 
 
 def _read_record(folder: Path, body: Body) -> dict[str, Any]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.embedding import Embedding, outer, target_points
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import read_body
+from softtwin.reference.data.discrepancy import Discrepancy, read_discrepancy
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import loaded_nodes
 from softtwin.registration.conditions import Conditions
@@ -54,6 +56,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 Engine = Registrar | HybridRegistrar | ContactRegistrar
+DOUBT = "doubt.npz"  # in a twin: what its organ may be otherwise
 Camera = Pose | PosePrior | Literal["align"] | None
 """Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
 is first looked for in the clouds themselves, None for clouds in the coordinates of the body at rest."""
@@ -89,6 +92,7 @@ class Twin:
         config: settings; `config.registration` says how clouds are registered.
         resources: what is given back when the twin is closed.
         fast: a faster model of the same body, which registers first (the hybrid engine); None for the model alone.
+        otherwise: what the organ may be otherwise, as `softtwin doubt` was asked; empty where it was not.
     """
 
     def __init__(
@@ -97,7 +101,9 @@ class Twin:
         config: Config | None = None,
         resources: ExitStack | None = None,
         fast: ForwardModel | None = None,
+        otherwise: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
+        self.otherwise = otherwise
         self._model: ForwardModel | None = model
         self._fast = fast
         self._body = model.body
@@ -486,7 +492,8 @@ class Home:
         config = with_options(self.config, {**options, **({"model": model} if model else {})})
         with ExitStack() as opened:
             both = opened.enter_context(forward_models(config.registration.model, self.folder, self.body, config))
-            return Twin(both[0], config, opened.pop_all(), both[1])
+            known = known_doubt(self.folder, self.body, config)
+            return Twin(both[0], config, opened.pop_all(), both[1], {} if known is None else known[1])
 
 
 def find_twin(place: Path | str) -> Home:
@@ -533,7 +540,8 @@ def forward_models(
         ConfigError: there is no surrogate.
         ValueError: a surrogate of another material than the configuration's.
     """
-    network = None
+    network, known = None, known_doubt(folder, body, config)
+    further = None if known is None else known[0]
     if name != "reference":
         if not (folder / "surrogate.json").is_file():
             raise ConfigError(
@@ -543,6 +551,10 @@ def forward_models(
         from softtwin.surrogate.twin import load  # torch is needed here alone
 
         network = load(folder, body)
+        if further is not None:
+            from softtwin.surrogate.discrepancy import beside
+
+            network = beside(network, further)
     if name == "surrogate":
         assert network is not None
         yield network, None
@@ -564,4 +576,24 @@ def forward_models(
     modulus = scenario.modulus(config.material.young_modulus, body)
     material = MATERIALS[config.material.law](modulus, config.material.poisson_ratio)
     with Problem(body, material, options, held=scenario.held) as problem:
-        yield ReferenceModel(problem, patient=False, loading=loading, predictor=network), network
+        model = ReferenceModel(problem, patient=False, loading=loading, predictor=network, discrepancy=further)
+        yield model, network
+
+
+def known_doubt(folder: Path, body: Body, config: Config) -> tuple[Discrepancy, dict[str, Any]] | None:
+    """What `softtwin doubt` found that a twin's organ may be otherwise, and was asked; None where it was not.
+
+    Raises:
+        ConfigError: it was found for another law of material.
+        DiscrepancyError: the file cannot be used.
+    """
+    file = folder / DOUBT
+    if not file.is_file():
+        return None
+    found, made_of = read_discrepancy(file, body)
+    if made_of.get("material") != config.material.law:
+        raise ConfigError(
+            f"{file}: made for the material {made_of.get('material')!r}, and material.law is {config.material.law!r}; "
+            "make it again with `softtwin doubt`."
+        )
+    return found, made_of

@@ -213,7 +213,8 @@ def measured(folder: Path, engine: str, states: list[tuple[Floats, Floats, Float
     material = home.config.material.model_copy(
         update={"young_modulus_deviation": 0.3, **({"law": "linear-elastic"} if engine == _LINEAR else {})}
     )
-    home = type(home)(home.folder, home.body, home.config.model_copy(update={"material": material}))
+    place = home.folder / "none" if engine == _LINEAR else home.folder  # what it may be otherwise is of another law
+    home = type(home)(place, home.body, home.config.model_copy(update={"material": material}))
     with threadpool_limits(1), home.twin(**ENGINES[engine]) as twin:
         return summary([one(twin, *state) for state in states])
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softtwin.meshes.embedding import outer_nodes
 from softtwin.reference.data.dataset import DataSet, Samples
+from softtwin.reference.data.discrepancy import Discrepancy, discrepancy_of
 
 from .model import Surrogate
 
 Floats = NDArray[np.float64]
-_FOLDS = 4
-_MOST = 10.0  # times the median of the errors' norms
+_BOUND = 10.0  # times the median of the errors' norms
+_LEAST = 4  # samples that something is learned of
 
 
 def relative_errors(surrogate: Surrogate, data: DataSet, samples: Samples) -> Floats:
@@ -35,12 +36,9 @@ def relative_errors(surrogate: Surrogate, data: DataSet, samples: Samples) -> Fl
 
 
 def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 32) -> Surrogate:
-    """The surrogate with the patterns of its errors on the validation samples: see `Discrepancy`.
+    """The surrogate with the patterns of its errors on the validation samples: see `discrepancy_of`.
 
-    What the patterns leave out is measured on samples that they were not made from. Errors far above the others count
-    as some times their median, as in spherical principal components (Locantore et al. 1999): patterns are of what the
-    errors look like, and how large they are is found anew in each registration. Of fewer than four samples nothing is
-    learned: the surrogate stays as it is.
+    Of fewer than four samples nothing is learned: the surrogate stays as it is.
 
     Args:
         surrogate: the surrogate.
@@ -48,40 +46,25 @@ def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 32) -> Sur
         most: most patterns kept.
     """
     samples = data.samples("validation")
-    if len(samples) < _FOLDS:
+    if len(samples) < _LEAST:
         return surrogate
-    missing, bounded = _bounded(relative_errors(surrogate, data, samples))
-    left_out = np.zeros_like(missing)
-    for fold in range(_FOLDS):
-        held = np.arange(len(missing)) * _FOLDS // len(missing) == fold  # whole paths: their samples are alike
-        modes = _modes(missing[~held], most)[0]
-        left_out[held] = missing[held] - (missing[held] @ modes) @ modes.T
-    modes, sizes = _modes(missing, most)
-    rest = np.sqrt((left_out**2).mean(axis=0).reshape(-1, 3).mean(axis=1))
-    maps = replace(surrogate.maps, error_modes=modes * sizes, error_rest=rest)
-    seen = left_out.reshape(len(missing), -1, 3)[:, outer_nodes(data.body)]
-    card = {**surrogate.card, "discrepancy": {"samples": len(missing), "bounded": bounded, "places": _places(seen)}}
+    found, bounded = discrepancy_of(relative_errors(surrogate, data, samples), data.body, most, _BOUND)
+    entry = {"samples": len(samples), "bounded": bounded}
+    return _with(surrogate, found, entry)
+
+
+def beside(surrogate: Surrogate, further: Discrepancy) -> Surrogate:
+    """The surrogate that may be wrong by other patterns, too: of what the reference itself does not know.
+
+    Args:
+        surrogate: the surrogate.
+        further: the patterns.
+    """
+    own = surrogate.discrepancy
+    return _with(surrogate, further if own is None else own.beside(further), surrogate.card.get("discrepancy", {}))
+
+
+def _with(surrogate: Surrogate, found: Discrepancy, entry: Mapping[str, float]) -> Surrogate:
+    maps = replace(surrogate.maps, error_modes=found.modes, error_rest=found.rest)
+    card = {**surrogate.card, "discrepancy": {**entry, "places": found.places}}
     return Surrogate(surrogate.body, maps, surrogate.network, card)
-
-
-def _bounded(missing: Floats) -> tuple[Floats, int]:
-    """The errors with no norm above so many times their median, and how many were."""
-    sizes = np.linalg.norm(missing, axis=1)
-    parts = np.minimum(1.0, _MOST * np.median(sizes) / np.maximum(sizes, 1e-300))
-    return parts[:, None] * missing, int((parts < 1.0).sum())
-
-
-def _places(fields: Floats) -> float:
-    """Number of places at which fields (s, p, 3) are independent: tr(C)^2 / tr(C^2) of their correlation matrix C."""
-    scaled = fields / np.maximum(np.sqrt((fields**2).mean(axis=(0, 2)))[None, :, None], 1e-300)
-    scaled = np.concatenate(list(scaled.transpose(2, 0, 1)))  # each axis a sample of its own
-    scaled /= np.maximum(np.linalg.norm(scaled, axis=1), 1e-300)[:, None]  # a few large errors must not speak for all
-    gram = scaled @ scaled.T
-    return max(1.0, float(np.trace(gram) ** 2 / max((gram**2).sum(), 1e-300)))
-
-
-def _modes(missing: Floats, most: int) -> tuple[Floats, Floats]:
-    """Orthonormal patterns, (3n, m), and the root mean square of the errors along each, (m,)."""
-    _, values, patterns = np.linalg.svd(missing, full_matrices=False)
-    kept = slice(0, most)
-    return np.ascontiguousarray(patterns[kept].T), values[kept] / np.sqrt(len(missing))

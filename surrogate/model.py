@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
+from softtwin.reference.data.discrepancy import Discrepancy
 from softtwin.reference.data.loading import checked_array
 
 from .architecture import Linearisation, Network
@@ -22,21 +22,6 @@ from .maps import LinearMaps
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True, eq=False)
-class Discrepancy:
-    """What a surrogate gets wrong, as a normal law: u - u* = size (modes a + rest), size the largest displacement.
-
-    Args:
-        modes: for a of unit variance, (3n, m), dimensionless.
-        rest: standard deviation of what they leave out in one component of each node, (n,), dimensionless.
-        places: number of places on the boundary where that is independent: neighbours share it.
-    """
-
-    modes: Floats
-    rest: Floats
-    places: float
 
 
 class SurrogateState:

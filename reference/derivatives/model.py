@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softtwin.meshes.body import Body
 
+from ..data.discrepancy import Discrepancy
 from ..data.inputs import Change, Inputs
 from ..data.loading import Loading, checked_array
 from ..data.materials import Material, with_parameters
@@ -47,6 +48,7 @@ class ReferenceModel:
             response, Newton's method goes on from the better one to the same tolerance, and a state that is no minimum
             is not taken: a poor network costs the time of its prediction and changes nothing (after Odot 2023,
             algorithm 5, which compares residuals).
+        discrepancy: what is not known of the organ, as patterns that the model may be wrong by (see `alternatives`).
 
     Raises:
         ValueError: a predictor of another body or material.
@@ -58,7 +60,9 @@ class ReferenceModel:
         patient: bool = True,
         loading: Loading | None = None,
         predictor: Predictor | None = None,
+        discrepancy: Discrepancy | None = None,
     ) -> None:
+        self.discrepancy = discrepancy
         self.problem, self.patient, self.loading = problem, patient, loading or Loading()
         if predictor is not None:
             check_predictor(predictor, problem)
@@ -75,10 +79,6 @@ class ReferenceModel:
     def error(self) -> float:
         """0: it is what others are measured by."""
         return 0.0
-
-    @property
-    def discrepancy(self) -> None:
-        """None, for the same reason."""
 
     @property
     def is_linear(self) -> bool:

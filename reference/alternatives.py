@@ -1,0 +1,228 @@
+"""What a model does not know of its organ: how far equilibria move where it is otherwise than the model has it.
+
+Bayesian approximation error (Kaipio and Somersalo 2005, section 5.8): alternatives are drawn from a prior, and how far
+they lie from the model under its own loads is an error of the model with a covariance.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from softtwin.meshes.body import Body
+
+from .data.dataset import DataSet, Samples
+from .data.outcome import NotConverged
+from .farm import share_out
+from .fem.fenicsx import MPI
+from .generate import Plan, plan_from_header, writing
+from .ranks import on_first
+from .solve.problem import Problem
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+_LEAST_HELD = 3  # nodes: on fewer the body may turn
+_TOO_FAR = 3.0  # times the largest displacement of the model's own state: another branch, or nothing holds the organ
+_BLOCK = 4  # draws that are solved and written together
+
+
+@dataclass(frozen=True)
+class Alternatives:
+    """How else an organ may be than its model: a prior.
+
+    Args:
+        attachment: what holds the organ lies elsewhere on its surface: standard deviation of each coordinate of the
+            shift, metres; 0 for as the model has it.
+        poisson_ratio: least and largest, all alike; None for the model's.
+
+    Raises:
+        ValueError: an argument out of its range, or nothing that may be otherwise.
+    """
+
+    attachment: float = 0.0
+    poisson_ratio: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.attachment < np.inf:
+            raise ValueError(f"Alternatives.attachment: expected a length of 0 m or more, got {self.attachment}.")
+        ratio = self.poisson_ratio
+        if ratio is not None and not 0.0 <= ratio[0] <= ratio[1] < 0.5:
+            raise ValueError(f"Alternatives.poisson_ratio: expected 0 <= least <= largest < 0.5, got {ratio}.")
+        if self.attachment == 0.0 and ratio is None:
+            raise ValueError("Alternatives: expected something that may be otherwise than in the model, got nothing.")
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """How far alternatives lie from the model.
+
+    Args:
+        errors: displacement of the alternative less the model's, over the model's largest, (s, 3n).
+        failed: draws without an equilibrium, held by too few nodes, or beyond sense; they are in no error.
+    """
+
+    errors: Floats
+    failed: int
+
+
+def differences(
+    path: Path | str | None,
+    alternatives: Alternatives | None,
+    count: int = 64,
+    seed: int = 0,
+    comm: Any = MPI.COMM_WORLD,
+) -> Differences | None:
+    """Alternatives under the training loads of a data set, a draw for each of so many loads; collective.
+
+    Goes on where it was interrupted.
+
+    Args:
+        path: folder of the data set, whose training split is finished; as the alternatives read on rank 0 alone.
+        alternatives: what may be otherwise.
+        count: draws.
+        seed: of the draws.
+        comm: the ranks that share the work.
+
+    Returns:
+        What was found on rank 0, None on the others.
+
+    Raises:
+        DataSetError: the training split is not finished, or somebody else writes the data set.
+        FailedElsewhere: on the others, where rank 0 raises one of these or what else went wrong, on any rank.
+        ValueError: fewer than one draw, or a body that nothing holds.
+    """
+    with threadpool_limits(1), ExitStack() as held:
+
+        def prepare() -> tuple[str, Path, Alternatives, list[int]]:
+            assert path is not None and alternatives is not None, "rank 0 gives both"
+            if count < 1:
+                raise ValueError(f"differences.count: expected at least 1, got {count}.")
+            data = DataSet(path)
+            data.check_complete("train")
+            if alternatives.attachment:
+                shifted(data.body, np.zeros(3))
+            held.enter_context(writing(Path(path)))
+            folder = _folder(data, alternatives, seed)
+            blocks = [block for block in range(-(-count // _BLOCK)) if not _file(folder, block).exists()]
+            return str(path), folder, alternatives, blocks
+
+        found = on_first(comm, prepare)
+        first = comm.bcast(None if found is None else found[:3], root=0)
+        task = partial(difference_block, folder=first[1], alternatives=first[2], seed=seed)
+        share_out(task, first[0], found[3] if found else [], comm, "alternatives")
+        return None if found is None else _read(found[1], count)
+
+
+def forget(path: Path | str) -> None:
+    """Throw away what interrupted draws have left beside a data set.
+
+    Args:
+        path: folder of the data set.
+    """
+    shutil.rmtree(Path(path).parent / "doubt", ignore_errors=True)
+
+
+def difference_block(path: str, block: int, folder: Path, alternatives: Alternatives, seed: int) -> int:
+    """Draw, solve and write a few alternatives; returns their block's number.
+
+    Args:
+        path: folder of the data set.
+        block: number of the block.
+        folder: where its file goes.
+        alternatives: what may be otherwise.
+        seed: of the draws.
+    """
+    data, samples, plan = _opened(path, (Path(path) / "zarr.json").stat().st_mtime_ns)
+    draws = range(block * _BLOCK, (block + 1) * _BLOCK)
+    with threadpool_limits(1):
+        each = [_difference(data, samples, plan, alternatives, draw, seed) for draw in draws]
+    missing = np.full(data.body.points.size, np.nan)
+    partial_file = folder / f".{block}.partial.npy"
+    np.save(partial_file, np.stack([missing if error is None else error for error in each]))
+    partial_file.replace(_file(folder, block))
+    return block
+
+
+@lru_cache(maxsize=1)
+def _opened(path: str, made: int) -> tuple[DataSet, Samples, Plan]:
+    """`made`, the time of the header, tells a data set that was made again in the same place."""
+    data = DataSet(path)
+    return data, data.samples("train"), plan_from_header(data.header)
+
+
+def _difference(
+    data: DataSet, samples: Samples, plan: Plan, alternatives: Alternatives, draw: int, seed: int
+) -> Floats | None:
+    """One alternative less the model's state, over its largest displacement, (3n,); None where there is none."""
+    rng, place = np.random.default_rng([seed, draw]), draw % len(samples)
+    body, known = data.body, samples.displacements[place]
+    forces = np.zeros_like(body.points)
+    forces[data.response.loaded] = samples.forces[place]
+    if alternatives.attachment:
+        held = shifted(body, alternatives.attachment * rng.standard_normal(3))
+        if len(held) < _LEAST_HELD:
+            return None
+        if alternatives.poisson_ratio is None and np.array_equal(held, body.fixed):
+            return np.zeros(body.points.size)
+        body = body.with_sets(fixed=held)
+        forces[held] = 0.0
+    if alternatives.poisson_ratio is not None:
+        plan = replace(plan, poisson_ratio=float(rng.uniform(*alternatives.poisson_ratio)))
+    try:
+        with Problem(body, plan.build_material(), plan.newton) as problem:
+            off = problem.solve(forces, stability=False).displacement - known
+    except NotConverged:
+        return None
+    size = max(float(np.linalg.norm(known, axis=1).max()), 1e-12)
+    return None if np.linalg.norm(off, axis=1).max() > _TOO_FAR * size else np.asarray(off.ravel() / size)
+
+
+def shifted(body: Body, shift: Floats) -> Ints:
+    """The nodes that hold a body, moved along its surface: numbers of the nodes that are held then.
+
+    A node of the boundary is held where the one nearest to the place that it would come from is.
+
+    Args:
+        body: with fixed nodes.
+        shift: (3,), metres.
+
+    Raises:
+        ValueError: none is fixed on the boundary.
+    """
+    boundary = body.boundary_nodes
+    is_held = np.isin(boundary, body.fixed)
+    if not is_held.any():
+        raise ValueError("shifted.body: expected fixed nodes on the boundary, got none.")
+    nearest = body.boundary_tree.query(body.points[boundary] - shift)[1]
+    return np.asarray(boundary[is_held[nearest]])
+
+
+def _folder(data: DataSet, alternatives: Alternatives, seed: int) -> Path:
+    """Where the blocks of these draws lie; those of others are thrown away."""
+    words = json.dumps([data.identity, asdict(alternatives), seed])
+    parent = data.path.parent / "doubt"
+    folder = parent / hashlib.sha256(words.encode()).hexdigest()[:16]
+    if not folder.is_dir():
+        forget(data.path)
+        folder.mkdir(parents=True)
+    return folder
+
+
+def _file(folder: Path, block: int) -> Path:
+    return folder / f"{block}.npy"
+
+
+def _read(folder: Path, count: int) -> Differences:
+    every = np.concatenate([np.load(_file(folder, block)) for block in range(-(-count // _BLOCK))])[:count]
+    whole = np.isfinite(every).all(axis=1)
+    return Differences(every[whole], int((~whole).sum()))
