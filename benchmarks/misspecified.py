@@ -7,12 +7,15 @@ States of the quickstart's organ under one pull at a patch of 20 mm of the side 
 stiffer or softer, less or more compressible, held elsewhere, or meshed anew; clouds of 1,000 points from the
 quickstart's camera with 0.5 mm of noise, from rest, no zone told. The newtons' doubt knows that the modulus may be a
 third off. `ratio unknown`: Poisson's ratio is found as well. Refused frames are counted and left out of the shares.
+With `--no-doubt` margins know of no alternatives of the organ (`softtwin doubt`), in a record of their own.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +27,7 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from softtwin.app.quickstart import CAMERA, POINTS
-from softtwin.app.twin import find_twin
+from softtwin.app.twin import DOUBT, find_twin
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import embed
@@ -35,7 +38,7 @@ from softtwin.reference.solve.problem import Problem
 from softtwin.registration.verdict import Verdict
 
 Floats = NDArray[np.float64]
-NAME = "misspecified"
+NAME, WITHOUT = "misspecified_doubt", "misspecified"
 NOISE, PATCH, MODULUS, RATIO = 5e-4, 0.02, 5000.0, 0.45
 SHARES = (0.5, 0.9, 0.95)
 _WAVES = 300
@@ -192,31 +195,38 @@ def main() -> None:
     parser.add_argument("--truths", type=int, default=200)
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
     parser.add_argument("--engines", nargs="+", default=list(ENGINES), choices=list(ENGINES))
-    parser.add_argument("--name", default=NAME, help="of the record")
+    parser.add_argument("--no-doubt", action="store_true", help="margins know of no alternatives of the organ")
+    parser.add_argument("--name", help="of the record")
     arguments = parser.parse_args()
-    found, home = recorded(arguments.name), find_twin(arguments.folder)
+    name = arguments.name or (WITHOUT if arguments.no_doubt else NAME)
+    found, home = recorded(name), find_twin(arguments.folder)
+    if not (arguments.no_doubt or (home.folder / DOUBT).is_file()):
+        parser.error(f"{arguments.folder}: expected what `softtwin doubt` makes, found none; make it, or --no-doubt")
     for kind in arguments.kinds:
         states: list[tuple[Floats, Floats, Floats]] = []
         for engine in arguments.engines:
             key = f"{engine}: {kind}"
             if key not in found and not (engine == _LINEAR and kind != "as it is"):
                 states = states or list(truths(home.body, kind, arguments.truths))
-                found[key] = measured(arguments.folder, engine, states)
-                write(arguments.name, found)
+                found[key] = measured(arguments.folder, engine, states, not arguments.no_doubt)
+                write(name, found)
             if key in found:
                 print(key, json.dumps(found[key]), sep="\n  ", flush=True)
 
 
-def measured(folder: Path, engine: str, states: list[tuple[Floats, Floats, Floats]]) -> dict[str, Any]:
+def measured(folder: Path, engine: str, states: list[tuple[Floats, Floats, Floats]], doubt: bool) -> dict[str, Any]:
     """One row."""
     home = find_twin(folder)
     material = home.config.material.model_copy(
         update={"young_modulus_deviation": 0.3, **({"law": "linear-elastic"} if engine == _LINEAR else {})}
     )
-    place = home.folder / "none" if engine == _LINEAR else home.folder  # what it may be otherwise is of another law
-    home = type(home)(place, home.body, home.config.model_copy(update={"material": material}))
-    with threadpool_limits(1), home.twin(**ENGINES[engine]) as twin:
-        return summary([one(twin, *state) for state in states])
+    with tempfile.TemporaryDirectory() as kept:
+        place = Path(shutil.copytree(home.folder, Path(kept) / "twin"))
+        if not doubt or engine == _LINEAR:  # what it may be otherwise is of another law
+            (place / DOUBT).unlink(missing_ok=True)
+        home = type(home)(place, home.body, home.config.model_copy(update={"material": material}))
+        with threadpool_limits(1), home.twin(**ENGINES[engine]) as twin:
+            return summary([one(twin, *state) for state in states])
 
 
 if __name__ == "__main__":

@@ -341,13 +341,13 @@ def inverse() -> None:
             )
 
 
-def misspecified() -> None:
+def misspecified(name: str) -> None:
     """Doubt where the organ is not what the twin takes it for."""
-    found = recorded("misspecified")
+    found = recorded(name)
     if not found:
         return
     covered = "nodes covered by 50 / 90 / 95 % margins"
-    head("misspecified", "accepted; refused of", "error; predicted mm", covered, "inner", "force", "z rms", "median s")
+    head(name, "accepted; refused of", "error; predicted mm", covered, "inner", "force", "z rms", "median s")
     for key, f in found.items():
         if "error_mm" in f:
             row(
@@ -377,7 +377,8 @@ def print_all() -> None:
     active_rounds()
     throughput()
     inverse()
-    misspecified()
+    misspecified("misspecified")
+    misspecified("misspecified_doubt")
 
 
 def tables_of(text: str) -> dict[str, list[str]]:
