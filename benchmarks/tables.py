@@ -273,7 +273,8 @@ def throughput() -> None:
         return
     head("throughput", "draws a second", "efficiency", "20,480 at that rate, h", "before the first draw, s", "rejected")
     for key, f in found.items():
-        body, ranks = key.split(",")[0], int(key.split(",")[1].split()[0])
+        body, _, words = key.rpartition(", ")
+        ranks = int(words.split()[0])
         alone = found[f"{body}, 1 rank"]["draws_a_second"]
         row(
             f"{key}, {f['draws']:,} draws",
