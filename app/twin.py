@@ -28,6 +28,7 @@ from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.lbfgs import LBFGS
+from softtwin.registration.marks import Marks
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import (
     NOISE,
@@ -204,7 +205,14 @@ class Twin:
         return Certifier(network)
 
     def register(
-        self, cloud: ArrayLike, zone: str | None = None, start: Registration | None = None, camera: Camera = None
+        self,
+        cloud: ArrayLike,
+        zone: str | None = None,
+        start: Registration | None = None,
+        camera: Camera = None,
+        *,
+        landmarks: tuple[ArrayLike, ArrayLike] | None = None,
+        landmark_deviation: float = 2e-3,
     ) -> Registration:
         """The forces and the state that explain a cloud, with a verdict on them.
 
@@ -214,15 +222,31 @@ class Twin:
                 given.
             start: result of an earlier frame to start from; no force if not given.
             camera: where the camera stands.
+            landmarks: points on the observed side at rest, and where the same points were found, in the cloud's
+                coordinates, (l, 3) each, metres: they pull beside the cloud.
+            landmark_deviation: standard deviation of each coordinate of where they were found, metres.
 
         Raises:
-            ConfigError: no such zone.
+            ConfigError: no such zone; landmarks beside a contact of unknown place.
             CloudError: a cloud that is empty, holds NaN, lies too far from the body, or shows no one pose.
             NotConverged: the model found no state at the start.
+            ValueError: landmarks that do not lie on the observed side, or of other shapes.
         """
         if camera == "align":
             camera = self.aligned(cloud)
-        return self._posed_result(cloud, zone, camera, lambda registrar, points: registrar.register(points, start))
+
+        def run(registrar: Engine, points: Floats) -> Registration:
+            if landmarks is None:
+                return registrar.register(points, start)
+            if isinstance(registrar, ContactRegistrar):
+                raise ConfigError("landmarks: expected none beside a contact of unknown place, got some.")
+            places = np.asarray(landmarks[1], dtype=np.float64)
+            if isinstance(camera, Pose) and places.ndim == 2 and places.shape[1] == 3:
+                places = camera.inverse().apply(places)
+            marks = Marks.of(registrar.observed, landmarks[0], places, landmark_deviation)
+            return registrar.marked(marks).register(points, start)
+
+        return self._posed_result(cloud, zone, camera, run)
 
     def follow(
         self, cloud: ArrayLike, zone: str | None, last: Registration | None, camera: Camera, until: float = np.inf

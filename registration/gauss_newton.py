@@ -13,6 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from softtwin.reference.data.outcome import NotConverged
 
+from . import marks
 from .evidence import Scales, find_scales, linearised
 from .independence import inflation
 from .loss import Huber, Loss, Tukey, robust_deviation
@@ -312,13 +313,24 @@ class LocalModel:
         self.precision[problem.force_part] = 1.0 / self.scales.force**2
         trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
         self.information = trusted.T @ trusted
-        self._hessian = self.information + np.diag(self.precision)
+        self._marked(problem.mark_residuals(trial))
+        self._hessian = self.information + self.mark_information + np.diag(self.precision)
         self.gradient = self._gradient(residuals, self.weights)
         self.value = self.objective(trial, loss)
 
+    def _marked(self, off: Floats) -> None:
+        """What landmarks tell; they carry their own deviation, and the scales are found from the cloud alone."""
+        size = self.problem.size
+        self.mark_information, self._mark_gradient = np.zeros((size, size)), np.zeros(size)
+        if len(off):
+            jacobian = self.problem.mark_jacobian(self.trial)
+            weights = marks.LOSS.weight(off)
+            self.mark_information = (weights[:, None] * jacobian).T @ jacobian
+            self._mark_gradient = (weights * off) @ jacobian
+
     def _gradient(self, residuals: Floats, weights: Floats) -> Floats:
         by_distances = weights * residuals / self.deviations**2
-        return by_distances @ self.jacobian + self.precision * self.trial.coefficients
+        return by_distances @ self.jacobian + self.precision * self.trial.coefficients + self._mark_gradient
 
     def _found_scales(self, loss: Loss, noise: float, left_out: Floats, graduation: float) -> tuple[Scales, bool]:
         """Scales, and whether the noise is held above what the linear model alone would believe: the points' own."""
@@ -373,7 +385,8 @@ class LocalModel:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ trial.coefficients**2)
         scaled = self.problem.residuals(trial, self.own) / self.deviations
-        return float(loss.value(scaled).sum()) + prior
+        off = marks.LOSS.value(self.problem.mark_residuals(trial))
+        return float(loss.value(scaled).sum()) + float(off.sum()) + prior
 
     @property
     def length(self) -> float:
@@ -416,7 +429,8 @@ class LocalModel:
             alike: so many points tell what one would that errs by itself.
         """
         count = self.problem.forces.size
-        return posterior(self.information / alike, self.precision, self.trial.coefficients, self.scales, count)
+        told = self.information / alike + self.mark_information
+        return posterior(told, self.precision, self.trial.coefficients, self.scales, count)
 
     def alike(self) -> float:
         """How many points tell what one would that errs by itself, as the residuals here have it; see `inflation`."""

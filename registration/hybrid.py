@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 
 from softtwin.reference.data.outcome import NotConverged
 
+from .marks import Marks
 from .registrar import Registrar, Registration, badness
+from .residuals import SurfaceDistance
 from .verdict import Verdict
 
 
@@ -34,12 +36,21 @@ class HybridRegistrar:
         """The exact forward model."""
         return self.exact.model
 
+    @property
+    def observed(self) -> SurfaceDistance:
+        """The observed side."""
+        return self.exact.observed
+
     def limited(self, until: float) -> HybridRegistrar:
         """The same, which begins no step after a time of the monotonic clock, seconds; see `Registrar.limited`.
 
         Where the exact model has not ended by then, the better one of both results is given.
         """
         return HybridRegistrar(self.fast.limited(until), self.exact.limited(until))
+
+    def marked(self, marks: Marks | None) -> HybridRegistrar:
+        """The same with landmarks that pull beside the cloud, or without; see `Registrar.marked`."""
+        return HybridRegistrar(self.fast.marked(marks), self.exact.marked(marks))
 
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud; see `Registrar.register`.

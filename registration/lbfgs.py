@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 from softtwin.reference.data.outcome import NotConverged
 
+from . import marks
 from .gauss_newton import Found, LocalModel, Step
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
@@ -155,4 +156,9 @@ def _objective(problem: Problem, trial: Trial, loss: Loss, local: LocalModel) ->
     """Robust distances and their gradient by the coefficients, (k,), at the scales of a model."""
     scaled = problem.residuals(trial, local.own) / local.deviations
     slope = loss.weight(scaled) * scaled / local.deviations
-    return float(loss.value(scaled).sum()), problem.pulled(trial, slope)
+    value, gradient = float(loss.value(scaled).sum()), problem.pulled(trial, slope)
+    if problem.marks is None:
+        return value, gradient
+    off = problem.mark_residuals(trial)
+    gradient = gradient + problem.marks_pulled(trial, marks.LOSS.weight(off) * off)
+    return value + float(marks.LOSS.value(off).sum()), gradient

@@ -9,10 +9,12 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from .conditions import Conditions
 from .evidence import Scale
 from .forward import ConditionedModel, ConditionedState, ReducedModel, ReducedState
+from .marks import Marks
 from .pose import Pose
 from .residuals import Match, SurfaceDistance
 from .unknowns import Forces, ModelError, PosePrior
@@ -55,6 +57,7 @@ class Problem:
         noise: what is believed of the standard deviation of a point's distance, metres.
         error: what the model may get wrong; None where it is not known in patterns.
         conditions: unknowns beside the forces, which the model takes; None where there are none.
+        marks: landmarks that pull beside the cloud; None where there are none.
     """
 
     model: ReducedModel
@@ -65,6 +68,7 @@ class Problem:
     noise: Scale
     error: ModelError | None = None
     conditions: Conditions | None = None
+    marks: Marks | None = None
 
     @property
     def size(self) -> int:
@@ -171,34 +175,79 @@ class Problem:
     def jacobian(self, trial: Trial) -> Floats:
         """Derivative of the distances by the coefficients, (p, k), exact."""
         rows = self.observed.rows(trial.match)
+        return self._by_coefficients(trial, rows, self._by_pose(trial, trial.match.directions, trial.cloud))
+
+    def pulled(self, trial: Trial, cotangent: Floats) -> Floats:
+        """Gradient by the coefficients, (k,), from the one by the distances, (p,): J^T g with the adjoint."""
+        rows = self.observed.rows(trial.match)
+        return self._pulled(trial, rows, self._by_pose(trial, trial.match.directions, trial.cloud), cotangent)
+
+    def mark_residuals(self, trial: Trial) -> Floats:
+        """Coordinates of the landmarks less where they were found, over their deviation, (3l,), body's axes."""
+        if self.marks is None:
+            return np.zeros(0)
+        off = self.observed.moved_feet(self.marks.feet, trial.positions) - self._found_marks(trial)
+        return (off / self.marks.deviation).ravel()
+
+    def mark_jacobian(self, trial: Trial) -> Floats:
+        """Derivative of these by the coefficients, (3l, k), exact."""
+        if self.marks is None:
+            return np.zeros((0, self.size))
+        rows = self.marks.rows(self.observed) / self.marks.deviation
+        return self._by_coefficients(trial, rows, self._marks_by_pose(trial))
+
+    def marks_pulled(self, trial: Trial, cotangent: Floats) -> Floats:
+        """Gradient by the coefficients, (k,), from the one by the landmarks' residuals, (3l,), with the adjoint."""
+        if self.marks is None:
+            return np.zeros(self.size)
+        rows = self.marks.rows(self.observed) / self.marks.deviation
+        return self._pulled(trial, rows, self._marks_by_pose(trial), cotangent)
+
+    def _found_marks(self, trial: Trial) -> Floats:
+        """Where the landmarks were found, in the body's coordinates, (l, 3)."""
+        assert self.marks is not None
+        return self.marks.places if trial.pose is None else trial.pose.inverse().apply(self.marks.places)
+
+    def _marks_by_pose(self, trial: Trial) -> Floats | None:
+        assert self.marks is not None
+        axes = np.tile(np.eye(3) / self.marks.deviation, (len(self.marks), 1))
+        return self._by_pose(trial, axes, np.repeat(self._found_marks(trial), 3, axis=0))
+
+    def _by_coefficients(self, trial: Trial, rows: csr_array, by_pose: Floats | None) -> Floats:
+        """Derivative of linear functions of the observed nodes' displacement, (q, k), for rows (q, 3m)."""
         blocks = [trial.state.jacobian(rows)]
-        if self.pose is not None:
-            blocks.append(self._by_pose(trial))
+        if by_pose is not None:
+            blocks.append(by_pose)
         if self.conditions is not None:
             blocks.append(cast(ConditionedState, trial.state).rows_by_conditions(rows))
         if self.error is not None:
             blocks.append(self.error.jacobian(rows))
         return np.hstack(blocks)
 
-    def pulled(self, trial: Trial, cotangent: Floats) -> Floats:
-        """Gradient by the coefficients, (k,), from the one by the distances, (p,): J^T g with the adjoint."""
-        by_nodes = (self.observed.rows(trial.match).T @ cotangent).reshape(-1, 3)
+    def _pulled(self, trial: Trial, rows: csr_array, by_pose: Floats | None, cotangent: Floats) -> Floats:
+        """The same, transposed and applied, (k,)."""
+        by_nodes = (rows.T @ cotangent).reshape(-1, 3)
         full = np.zeros_like(self.observed.body.points)
         full[self.observed.nodes] = by_nodes
         blocks = [trial.state.full.pull(full).ravel() @ self.forces.basis]
-        if self.pose is not None:
-            blocks.append(cotangent @ self._by_pose(trial))
+        if by_pose is not None:
+            blocks.append(cotangent @ by_pose)
         if self.conditions is not None:
             blocks.append(full.ravel() @ cast(ConditionedState, trial.state).by_conditions())
         if self.error is not None:
             blocks.append(self.error.jacobian(by_nodes.ravel()))
         return np.concatenate(blocks)
 
-    def _by_pose(self, trial: Trial) -> Floats:
-        """A point of the cloud stays where it is: in the body's coordinates it moves against the pose."""
-        assert self.pose is not None and trial.pose is not None
-        in_camera = self.pose.jacobian(trial.coefficients[self.pose_part], trial.cloud)
-        along = trial.match.directions @ trial.pose.rotation.T  # directions in the camera's axes
+    def _by_pose(self, trial: Trial, directions: Floats, points: Floats) -> Floats | None:
+        """Of distances along directions, (p, 3), to points of the body's coordinates, (p, 3): (p, 6), if it is unknown.
+
+        What the camera sees stays where it is: in the body's coordinates it moves against the pose.
+        """
+        if self.pose is None:
+            return None
+        assert trial.pose is not None
+        in_camera = self.pose.jacobian(trial.coefficients[self.pose_part], points)
+        along = directions @ trial.pose.rotation.T  # directions in the camera's axes
         return np.einsum("pi,pij->pj", along, in_camera)
 
     def moved(self, trial: Trial, change: Floats) -> Floats:

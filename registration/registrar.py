@@ -24,6 +24,7 @@ from .forward import ForwardModel, ReducedModel, State, reduce_model
 from .gauss_newton import Found, GaussNewton, Step
 from .lbfgs import LBFGS
 from .loss import robust_deviation
+from .marks import Marks
 from .outcome import Outcome
 from .pose import Pose
 from .posterior import Posterior
@@ -304,6 +305,7 @@ class Registrar:
         is_found = conditions is not None and conditions.modulus is not None
         self.conditions, self.modulus_deviation = conditions, 0.0 if is_found else modulus_deviation
         self.anywhere = None if anywhere is None else cache(anywhere)  # made when it is first asked for
+        self.marks: Marks | None = None
         self.options = options or RegistrationOptions()
         discrepancy = model.discrepancy
         self.error = None if discrepancy is None else ModelError.of(discrepancy, observed.nodes)
@@ -337,6 +339,16 @@ class Registrar:
         other._thorough = replace(self._thorough, until=until)
         return other
 
+    def marked(self, marks: Marks | None) -> Registrar:
+        """The same with landmarks that pull beside the cloud, or without.
+
+        Args:
+            marks: of the same observed side; None for none.
+        """
+        other = copy.copy(self)
+        other.marks = marks
+        return other
+
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud.
 
@@ -360,7 +372,7 @@ class Registrar:
         if not is_missed or time.monotonic() >= self.options.solver.until:
             return found
         with suppress(NotConverged):
-            other = self.anywhere().limited(self.options.solver.until).register(cloud)
+            other = self.anywhere().limited(self.options.solver.until).marked(self.marks).register(cloud)
             if other.judgement.is_usable and other.rms_distance < _EXPLAINED * found.rms_distance:
                 reason = (
                     f"forces outside the zone explain the cloud better: points lie {1e3 * found.rms_distance:.2f} mm "
@@ -442,6 +454,7 @@ class Registrar:
             points,
             self.noise,
             conditions=self.conditions,
+            marks=self.marks,
         )
 
     def _problem(self, points: Floats, prepared: Prepared, near: Trial, doubt: float = 1.0) -> Problem:

@@ -127,6 +127,24 @@ class SurfaceDistance:
         found: Floats = np.einsum("pk,pki->pi", match.weights, self.rest[self.triangles[match.triangles]])
         return found
 
+    def moved_feet(self, match: Match, displacement: Floats) -> Floats:
+        """Where the closest points of a match at rest are after a displacement of `nodes`, (m, 3): (p, 3), metres."""
+        corners = (self.rest + self._carried(displacement))[self.triangles[match.triangles]]
+        found: Floats = np.einsum("pk,pki->pi", match.weights, corners)
+        return found
+
+    def rows_by_axes(self, match: Match) -> csr_array:
+        """Derivative of the coordinates of a match's closest points by the displacement of the nodes, (3p, 3m)."""
+        whole = csr_array(
+            (
+                np.repeat(match.weights, 3, axis=0).ravel(),
+                (3 * self.triangles[match.triangles][:, None, :] + np.arange(3)[:, None]).ravel(),
+                np.arange(0, 9 * len(match.weights) + 1, 3),
+            ),
+            shape=(3 * len(match.weights), 3 * len(self.rest)),
+        )
+        return self.by_nodes(whole)
+
     def rows(self, match: Match) -> csr_array:
         """Derivative of the distances with respect to the displacement of the observed nodes, (p, 3m).
 

@@ -20,6 +20,7 @@ from .problem import Problem
 Floats = NDArray[np.float64]
 _NEIGHBOURS = 6
 _ASKED = 250  # points at least, whose neighbours are looked at
+_MARK_OFF = 4.0  # deviations of a landmark's place; three axes together are beyond it once in a thousand
 _FEWEST_POINTS = 30
 _SMALL, _NEARLY_ALL = 0.1, 95.0  # turn (radians) or stretch that a linear law holds for; per cent of the cells
 
@@ -114,6 +115,7 @@ def judge(problem: Problem, found: Found, state: State, expected: Expectations) 
         *_of_the_state(problem, state, expected),
         *_of_the_pose(problem, found, expected),
         *_of_the_conditions(problem, found, expected),
+        *_of_the_marks(problem, found),
     ]
     if not findings:
         return Judgement(Verdict.ACCEPTED)
@@ -168,6 +170,17 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
     if outliers > expected.outliers:
         findings.append((Verdict.DOUBTFUL, f"{100 * outliers:.0f} % of the points fit nowhere"))
     return findings
+
+
+def _of_the_marks(problem: Problem, found: Found) -> list[_Finding]:
+    """Landmarks that lie far from where they were found: one was taken for another, or the state is another."""
+    if problem.marks is None:
+        return []
+    off = np.linalg.norm(problem.mark_residuals(found.trial).reshape(-1, 3), axis=1)
+    if off.max() <= _MARK_OFF:
+        return []
+    away = 1e3 * problem.marks.deviation * off.max()
+    return [(Verdict.DOUBTFUL, f"landmark {int(off.argmax())} lies {away:.1f} mm from where it was found")]
 
 
 def shared(feet: Floats, distances: Floats, weights: Floats) -> float:

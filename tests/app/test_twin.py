@@ -74,6 +74,23 @@ def test_a_known_camera_changes_nothing_but_coordinates(plain_twin: Twin, forces
     assert (np.abs(seen.net_force - plain.net_force) < 0.2 * plain.net_force_deviation).all()
 
 
+@pytest.mark.parametrize("camera", [None, TURNED])
+def test_landmarks_pull_beside_the_cloud(plain_twin: Twin, forces, camera: Pose | None) -> None:
+    """Of a cloud so noisy that they tell more, on the body's and on the camera's axes."""
+    truth = plain_twin.predict(forces).displacement
+    cloud = seen_cloud(plain_twin, forces) + 3e-3 * np.random.default_rng(5).standard_normal((1, 3))
+    seen = plain_twin.registrar().observed.nodes
+    ends = seen[np.argsort(plain_twin.body.points[seen, 0])[-6:]]
+    rest, places = plain_twin.body.points[ends], plain_twin.body.points[ends] + truth[ends]
+    turned = [points if camera is None else camera.apply(points) for points in (cloud, places)]
+    alone = plain_twin.register(turned[0], camera=camera)
+    both = plain_twin.register(turned[0], camera=camera, landmarks=(rest, turned[1]), landmark_deviation=1e-4)
+    errors = [np.linalg.norm((found.displacement - truth)[ends], axis=1).mean() for found in (alone, both)]
+    assert errors[1] < 0.5 * errors[0]
+    with pytest.raises(ValueError, match="expected points on the observed side at rest"):
+        plain_twin.register(turned[0], camera=camera, landmarks=(rest + 1.0, turned[1]))
+
+
 def test_an_unknown_camera_is_found_with_the_forces(plain_twin: Twin, forces) -> None:
     truth = TURNED.apply(plain_twin.body.points + plain_twin.predict(forces).displacement)
     cloud = TURNED.apply(seen_cloud(plain_twin, forces))
