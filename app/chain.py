@@ -136,7 +136,7 @@ def _doubt(space: Workspace, path: Path, say: Say) -> None:
         (space.twin / DOUBT).unlink(missing_ok=True)
         say("    nothing: [doubt] names none, and margins know of none")
     elif is_current(space, DataSet(space.data)):
-        say("    there already")
+        say("    as before")
     else:
         doubt_in_parallel(path, space.config.samples.ranks)
 

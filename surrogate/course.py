@@ -221,6 +221,12 @@ class Course(lightning.LightningModule):
         self.seconds = float(seconds)
         self.steps_made = self.trainer.global_step
 
+    def teardown(self, stage: str) -> None:
+        """Processes part before they end: gloo's threads abort one that ends while they wait for another."""
+        if self.trainer.world_size > 1 and torch.distributed.is_initialized():
+            torch.distributed.barrier()
+            torch.distributed.destroy_process_group()
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what Lightning does not know of."""
         checkpoint["course"] = {
