@@ -170,17 +170,19 @@ class Twin:
         """
         return self.model.solve(forces)
 
-    def certify(self, forces: ArrayLike, state: SurrogateState | None = None) -> Certificate:
+    def certify(self, forces: ArrayLike, state: SurrogateState | None = None, newton: bool = False) -> Certificate:
         """How wrong the network's displacement under nodal forces may be, and whether that may be relied upon.
 
         Args:
             forces: (n, 3), newtons, in the body's node order.
             state: what `predict` found for them, if that is at hand.
+            newton: read the bounds from one step of Newton's method, dearer and tighter, which also tells whether the
+                predicted state is stable.
 
         Raises:
             CalibrationError: the model is no network, or it was never calibrated.
         """
-        return self._certifier.certify(forces, state)
+        return self._certifier.certify(forces, state, newton)
 
     def bounded(self, found: Registration) -> Certificate | None:
         """How wrong the network may be about a registered state; None where there is none that was calibrated.

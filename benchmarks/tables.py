@@ -212,21 +212,31 @@ def certificates() -> None:
         "certificates",
         f"kept, mean error, %{ranges}",
         f"width / median error{ranges}",
-        "rank",
+        "rank of bound; of eta",
         "outside %: 1 x; 3 x; of 3 x inside kept",
-        "Newton step: rank; indefinite",
-        "ms: prediction; distance; certificate; Newton step",
+        "unstable",
+        "ms",
     )
     for body, f in found.items():
-        held, ms, newton = f["held_out"], f["ms"], f["newton_step"]
+        ms, tiers = f["ms"], {"certificate": f["held_out"], "newton": f["held_out_newton"]}
+        for tier, held in tiers.items():
+            unstable, outside = held["unstable"], f["outside"]
+            row(
+                f"{body}, {tier}: {held['samples']} loads",
+                f"{100 * held['kept']['mean']:.1f}; "
+                + " / ".join(f"{100 * k:.1f}" for k in held["kept_in_range"]["mean"]),
+                " / ".join(f"{width:.2f}" for width in held["widths"]["mean"]),
+                f"{held['rank_correlation']['mean']:.3f}; {held['step_correlation']['mean']:.3f}",
+                f"{100 * outside['times_1']:.1f}; {100 * outside['times_3']:.1f}; {_kept_inside(outside)}"
+                if tier == "certificate"
+                else "-",
+                "-" if unstable is None else f"{unstable} of {held['samples']}",
+                f"{ms[tier]:.2f}",
+            )
         row(
-            f"{body}: {held['samples']} loads",
-            f"{100 * held['kept']['mean']:.1f}; " + " / ".join(f"{100 * k:.1f}" for k in held["kept_in_range"]["mean"]),
-            " / ".join(f"{width:.2f}" for width in held["widths"]["mean"]),
-            f"{held['rank_correlation']['mean']:.3f}",
-            f"{100 * f['outside']['times_1']:.1f}; {100 * f['outside']['times_3']:.1f}; {_kept_inside(f['outside'])}",
-            f"{newton['rank_correlation']:.3f}; {newton['indefinite']} of {newton['samples']}",
-            "; ".join(f"{ms[name]:.2f}" for name in ("prediction", "distance", "step", "newton")),
+            f"{body}: prediction; distance; solve",
+            *["-"] * 5,
+            f"{ms['prediction']:.2f}; {ms['distance']:.3f}; {ms['solve']:.1f}",
         )
 
 

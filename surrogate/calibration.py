@@ -1,29 +1,31 @@
 """Certificates calibrated on loads that nobody learned from, and what they are worth on others.
 
-A product of powers of the signs, fitted to the errors, ranks predictions; split conformal prediction turns it into a
-bound that a wanted share of loads keeps, in each range of size apart (normalised: Papadopoulos, Gammerman and Vovk
-2008; Mondrian: Vovk, Gammerman and Shafer 2005).
+A product of powers of the signs, fitted to a high quantile of the errors, ranks predictions; split conformal prediction
+turns it into a bound that a wanted share of loads keeps, in each range of size apart (normalised: Papadopoulos,
+Gammerman and Vovk 2008; Mondrian: Vovk, Gammerman and Shafer 2005). Draws that share a load path count together
+(hierarchical conformal prediction: Lee, Barber and Willett 2023, arXiv 2306.06342).
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linprog
 from scipy.stats import spearmanr
 
 from softtwin.meshes.metrics import nodal_distances
-from softtwin.reference.data.dataset import DataSet, Samples, Split
+from softtwin.reference.data.dataset import DataSet, Samples, Split, stored_plan
 
 from .certificate import ERRORS, Certifier
 from .model import Surrogate
-from .signs import CalibrationError, SignReader, Signs
+from .signs import CalibrationError, Error, SignReader, Signs
 
 Floats = NDArray[np.float64]
-_SHRINKAGE = 1.0  # of the fitted powers, in units of one sample of each sign's spread
+Ints = NDArray[np.int64]
 _A_RANGE = 50  # calibration samples that a range of its own should have
 _RANGES = 4  # of size, at most
 _USUAL = 0.99  # of the calibration samples: who is farther out of balance is set aside
@@ -34,7 +36,7 @@ class CalibrationWarning(UserWarning):
 
 
 def needed(confidence: float) -> int:
-    """Calibration samples without which no bound of a confidence is finite."""
+    """Load paths to calibrate on, without which no bound of a confidence is finite; draws of one `ramp` are one."""
     return int(np.ceil(confidence / (1.0 - confidence) - 1e-9))
 
 
@@ -44,11 +46,12 @@ def calibrate(
     split: Split = "calibration",
     fitted_on: Split = "validation",
     confidence: float = 0.9,
+    stepped: int = 100,
 ) -> Surrogate:
     """The surrogate with a certificate in its card.
 
     Powers of the signs are fitted to the errors on one split, the bound is calibrated on another; neither was learned
-    from. Draws of one ramp share a load, and splits share no ramp.
+    from. Draws of one ramp share a load path, count together as one, and are in one split.
 
     Args:
         surrogate: the surrogate.
@@ -56,6 +59,8 @@ def calibrate(
         split: what is calibrated on.
         fitted_on: what the powers are fitted on.
         confidence: share of loads that shall keep the bound, in (0, 1).
+        stepped: so many samples of either split are shown a step of Newton's method too, each for the factors of a
+            tangent, to calibrate bounds that are read from it; none where they are too few.
 
     Raises:
         CalibrationError: too few samples (it says how many are needed), another body or material, or none in the card.
@@ -71,50 +76,88 @@ def calibrate(
     if wrong:
         raise CalibrationError(f"calibrate.data: {data.path} is of another material than the surrogate: {wrong[0]}.")
     held, fitted = data.samples(split), data.samples(fitted_on)
-    if len(held) < needed(confidence) or len(fitted) == 0:
+    paths = _paths(data, held)
+    if len(np.unique(paths)) < needed(confidence) or len(fitted) == 0:
         raise CalibrationError(
-            f"calibrate.data: expected at least {needed(confidence)} accepted samples to calibrate {confidence:.0%} on "
-            f"and some to fit on, got {len(held)} in the {split} and {len(fitted)} in the {fitted_on} split of "
-            f"{data.path}; {_A_RANGE} and more for each range of size make the bound one to go by."
+            f"calibrate.data: expected accepted samples of at least {needed(confidence)} load paths to calibrate a "
+            f"confidence of {confidence:g} on and some to fit on, got {len(np.unique(paths))} paths in the {split} and "
+            f"{len(fitted)} samples in the {fitted_on} split of {data.path}; {_A_RANGE} paths and more for each range "
+            "of size make the bound one to go by."
         )
     _compare_loads(surrogate, data)
     reader = SignReader(surrogate)
     shown, errors = _seen(reader, data, held)
     shown_before, errors_before = _seen(reader, data, fitted)
-    powers = {error: _fitted(shown_before, errors_before[error]) for error in ERRORS}
-    sizes = np.array([signs.size for signs in shown])
-    edges = np.quantile(sizes, np.linspace(0.0, 1.0, max(1, min(_RANGES, len(held) // _A_RANGE)) + 1))[1:-1]
-    places = np.searchsorted(edges, sizes, side="right")
-    rows = np.stack([signs.row for signs in shown])
-    with np.errstate(over="ignore"):  # a prediction inside out has no bound, and keeps that
-        scores = {error: errors[error] / np.exp(rows @ powers[error]) for error in ERRORS}
     entry = {
         "confidence": confidence,
-        "samples": len(held),
         "split": split,
-        "edges": edges.tolist(),
-        "in_range": np.bincount(places, minlength=len(edges) + 1).tolist(),
-        "powers": {error: powers[error].tolist() for error in ERRORS},
-        "quantiles": {
-            error: [quantile(values[places == place], confidence) for place in range(len(edges) + 1)]
-            for error, values in scores.items()
-        },
+        **_bounds((shown_before, errors_before), (shown, errors), paths, confidence),
         "limits": {
             name: _limit([getattr(signs, name) for signs in shown], share)
-            for name, share in (("size", 1.0), ("residual", _USUAL), ("step", _USUAL))
+            for name, share in (("size", 1.0), ("residual", _USUAL), ("step", _USUAL), ("force_ratio", _USUAL))
+            if getattr(shown[0], name) is not None
         },
-        "rank_correlation": {error: _rank(rows @ powers[error], errors[error]) for error in ERRORS},
     }
+    if len(np.unique(paths[:stepped])) >= needed(confidence):
+        before, after = (_seen(reader, data, _first(samples, stepped), newton=True) for samples in (fitted, held))
+        entry["newton"] = _bounds(before, after, paths[:stepped], confidence)
     return surrogate.with_card(certificate=entry)
 
 
-def _seen(reader: SignReader, data: DataSet, samples: Samples) -> tuple[list[Signs], dict[str, Floats]]:
+_Seen = tuple[list[Signs], dict[str, Floats]]
+
+
+def _bounds(before: _Seen, seen: _Seen, paths: Ints, confidence: float) -> dict[str, Any]:
+    """Powers of the signs and the quantile of what is left, for each range of size.
+
+    Args:
+        before: signs and errors that the powers are fitted to.
+        seen: those that the quantiles are taken of.
+        paths: number of the load path of each of the latter, (s,).
+        confidence: share of loads that shall keep the bound.
+    """
+    shown, errors = seen
+    powers = {error: _fitted(before[0], before[1], error, confidence) for error in ERRORS}
+    count, sizes = len(np.unique(paths)), np.array([signs.size for signs in shown])
+    edges = np.quantile(sizes, np.linspace(0.0, 1.0, max(1, min(_RANGES, count // _A_RANGE)) + 1))[1:-1]
+    places = np.searchsorted(edges, sizes, side="right")
+    ranks = {error: np.stack([signs.row(error) for signs in shown]) @ powers[error] for error in ERRORS}
+    with np.errstate(over="ignore"):
+        scores = {error: errors[error] / np.exp(ranks[error]) for error in ERRORS}
+    lost = ~np.array([signs.is_finite for signs in shown])
+    members = [places == place for place in range(len(edges) + 1)]
+    for values in scores.values():
+        values[lost] = 0.0  # without signs the bound is infinite, which any error keeps
+    return {
+        "samples": len(shown),
+        "load_paths": count,
+        "edges": edges.tolist(),
+        "in_range": [int(some.sum()) for some in members],
+        "powers": {error: powers[error].tolist() for error in ERRORS},
+        "quantiles": {
+            error: [quantile(values[some], confidence, paths[some]) for some in members]
+            for error, values in scores.items()
+        },
+        "rank_correlation": {error: _rank(ranks[error], errors[error]) for error in ERRORS},
+    }
+
+
+def _first(samples: Samples, count: int) -> Samples:
+    return Samples(**{field.name: getattr(samples, field.name)[:count] for field in fields(samples)})
+
+
+def _paths(data: DataSet, samples: Samples) -> Ints:
+    """Number of the load path of each sample, (s,)."""
+    return samples.draws // int(stored_plan(data.header).get("ramp", 1))
+
+
+def _seen(reader: SignReader, data: DataSet, samples: Samples, newton: bool = False) -> _Seen:
     """Signs of the predictions of samples, and their true errors, metres, (s,) each."""
     forces, shown, found = np.zeros_like(data.body.points), [], np.empty_like(samples.displacements)
     for i, load in enumerate(samples.forces):
         forces[data.response.loaded] = load
         state = reader.surrogate.solve(forces)
-        shown.append(reader.read(forces, state))
+        shown.append(reader.read(forces, state, newton))
         found[i] = state.displacement
     distances = nodal_distances(found, samples.displacements)
     return shown, {"mean": distances.mean(axis=1), "largest": distances.max(axis=1)}
@@ -133,7 +176,10 @@ class Coverage:
         widths: median bound over median error in each range, likewise.
         in_range: samples in each range.
         rank_correlation: Spearman's, of bound and error; None where they do not vary.
+        step_correlation: the same of eta, the linear step towards balance (`Signs.step`), alone.
         outside: samples that the certificate sets aside; they count in all of the above.
+        newton: whether the bounds are read from steps of Newton's method.
+        unstable: predictions whose tangent has negative pivots; None where no such step was made.
     """
 
     split: str
@@ -144,7 +190,10 @@ class Coverage:
     widths: dict[str, list[float | None]]
     in_range: list[int]
     rank_correlation: dict[str, float | None]
+    step_correlation: dict[str, float | None]
     outside: int
+    newton: bool
+    unstable: int | None
 
     def as_dict(self) -> dict[str, Any]:
         """The figures as plain numbers, for JSON."""
@@ -159,26 +208,33 @@ class Coverage:
                 f"on the {error} nodal error, made for {100 * self.confidence:.0f} %; by size it is {widths} times the "
                 "median error"
             )
-        return "\n".join([*lines, f"certificate: {self.outside} of {self.samples} are set aside as outside its domain"])
+        aside = f"certificate: {self.outside} of {self.samples} are set aside as outside its domain"
+        return "\n".join([*lines, aside + ("" if self.unstable is None else f", {self.unstable} as unstable")])
 
 
-def coverage(surrogate: Surrogate, data: DataSet, split: Split = "test") -> Coverage:
+def coverage(
+    surrogate: Surrogate, data: DataSet, split: Split = "test", limit: int | None = None, newton: bool = False
+) -> Coverage:
     """How the certificate of a surrogate does on a split, by default the held-out test split.
 
     Args:
         surrogate: a calibrated one.
         data: equilibria of its body.
         split: of them.
+        limit: take the first so many draws only.
+        newton: judge the bounds that are read from steps of Newton's method.
 
     Raises:
-        CalibrationError: there is no certificate.
+        CalibrationError: there is no certificate, or none of such steps.
         DataSetError: the split is not complete.
     """
     certifier = Certifier(surrogate)
-    shown, errors = _seen(certifier.reader, data, data.samples(split))
+    shown, errors = _seen(certifier.reader, data, data.samples(split, limit), newton)
     given = [certifier.read(signs) for signs in shown]
     bounds = {error: np.array([getattr(each, error) for each in given]) for error in ERRORS}
-    edges = surrogate.card["certificate"]["edges"]
+    eta = np.array([signs.step for signs in shown])
+    known = surrogate.card["certificate"]
+    edges = (known["newton"] if newton else known)["edges"]
     places = np.searchsorted(edges, [each.signs.size for each in given], side="right")
     members = [places == place for place in range(len(edges) + 1)]
     kept = {error: errors[error] <= bounds[error] for error in ERRORS}
@@ -191,7 +247,10 @@ def coverage(surrogate: Surrogate, data: DataSet, split: Split = "test") -> Cove
         widths={error: [_ratio(bounds[error][some], errors[error][some]) for some in members] for error in ERRORS},
         in_range=[int(some.sum()) for some in members],
         rank_correlation={error: _rank(bounds[error], errors[error]) for error in ERRORS},
+        step_correlation={error: _rank(eta, errors[error]) for error in ERRORS},
         outside=sum(not each.is_inside for each in given),
+        newton=newton,
+        unstable=sum(bool(each.newton and each.newton.negative_pivots) for each in shown) if newton else None,
     )
 
 
@@ -210,8 +269,10 @@ def _ratio(bounds: Floats, errors: Floats) -> float | None:
 
 
 def _compare_loads(surrogate: Surrogate, data: DataSet) -> None:
-    learned = surrogate.card.get("data", {}).get("plan", {}).get("loads")
-    drawn = data.header.get("plan", {}).get("loads")
+    learned, drawn = (
+        {**plan["loads"], "ramp": plan.get("ramp", 1)} if plan.get("loads") else None
+        for plan in (surrogate.card.get("data", {}).get("plan", {}), stored_plan(data.header))
+    )
     if learned is not None and drawn is not None and learned != drawn:
         differing = [name for name in drawn if learned.get(name) != drawn[name]]
         warnings.warn(
@@ -222,23 +283,47 @@ def _compare_loads(surrogate: Surrogate, data: DataSet) -> None:
         )
 
 
-def _fitted(shown: list[Signs], errors: Floats) -> Floats:
-    """Intercept and powers of the signs, (4,), that errors go with: least squares of logarithms, shrunk a little."""
-    usable = np.array([np.isfinite(signs.residual) for signs in shown]) & (errors > 0.0)
+def _fitted(shown: list[Signs], found: dict[str, Floats], error: Error, confidence: float) -> Floats:
+    """Intercept and powers of the signs whose product such a share of errors stays below: quantile regression.
+
+    Least squares would follow the few predictions that are far from any equilibrium, whose steps mean little: bounds by
+    a Newton step were a quarter wider (beam under modal loads).
+
+    Source: Koenker and Bassett 1978; as a linear programme.
+    """
+    errors, rows = found[error], np.stack([signs.row(error) for signs in shown])
+    usable = np.array([signs.is_finite for signs in shown]) & (errors > 0.0)
     if not usable.any():
-        return np.array([0.0, 0.0, 0.0, 1.0])
-    rows = np.stack([signs.logarithms for signs in shown])[usable]
-    wanted = np.log(errors[usable])
+        return np.eye(rows.shape[1])[-1]
+    rows = rows[usable, 1:]
     centre, spread = rows.mean(axis=0), rows.std(axis=0) + 1e-12
-    scaled = (rows - centre) / spread
-    powers = np.linalg.solve(scaled.T @ scaled + _SHRINKAGE * np.eye(3), scaled.T @ (wanted - wanted.mean())) / spread
-    return np.concatenate([[wanted.mean() - powers @ centre], powers])
+    scaled = np.column_stack([np.ones(len(rows)), (rows - centre) / spread])
+    count, width = scaled.shape
+    solved = linprog(
+        np.concatenate([np.zeros(width), np.full(count, confidence), np.full(count, 1.0 - confidence)]),
+        A_eq=np.hstack([scaled, np.eye(count), -np.eye(count)]),
+        b_eq=np.log(errors[usable]),
+        bounds=[(None, None)] * width + [(0.0, None)] * (2 * count),
+    )
+    powers = solved.x[1:width] / spread
+    return np.concatenate([[solved.x[0] - powers @ centre], powers])
 
 
-def quantile(scores: Floats, confidence: float) -> float | None:
-    """The score that at least such a share of further ones keeps on average; None where there are too few to say."""
-    place = int(np.ceil((len(scores) + 1) * confidence - 1e-9)) - 1
-    return float(np.sort(scores)[place]) if place < len(scores) else None
+def quantile(scores: Floats, confidence: float, paths: Ints | None = None) -> float | None:
+    """The score that at least such a share of further ones keeps on average; None where there are too few to say.
+
+    Args:
+        scores: (s,).
+        confidence: the share.
+        paths: number of the load path of each, (s,): each path has the same weight; None where each is a path of its
+            own.
+    """
+    groups = np.arange(len(scores)) if paths is None else paths
+    _, place, counts = np.unique(groups, return_inverse=True, return_counts=True)
+    order = np.argsort(scores, kind="stable")
+    reached = np.cumsum(1.0 / counts[place[order]]) if len(order) else np.zeros(0)
+    kept = np.flatnonzero(reached >= (len(counts) + 1) * confidence - 1e-9)
+    return float(scores[order[kept[0]]]) if len(kept) else None
 
 
 def _limit(values: list[float], share: float) -> float:

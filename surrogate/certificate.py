@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.reference.data.loading import checked_array
 
 from .model import Surrogate, SurrogateState
-from .signs import CalibrationError, SignReader, Signs
+from .signs import CalibrationError, Error, NewtonStep, SignReader, Signs
 
 Floats = NDArray[np.float64]
-ERRORS = ("mean", "largest")  # over the nodes
+ERRORS: tuple[Error, ...] = get_args(Error)  # over the nodes
 
 
 @dataclass(frozen=True)
@@ -62,29 +62,41 @@ class Certifier:
         self._known: dict[str, Any] = dict(known)
         self.reader = SignReader(surrogate)
 
-    def certify(self, forces: ArrayLike, state: SurrogateState | None = None) -> Certificate:
+    def certify(self, forces: ArrayLike, state: SurrogateState | None = None, newton: bool = False) -> Certificate:
         """How wrong the prediction for nodal forces may be.
 
         Args:
             forces: (n, 3), newtons.
             state: what the surrogate predicts for them, if that is known.
+            newton: read the bounds from one step of Newton's method: dearer, much tighter, and it tells whether the
+                prediction is stable.
 
         Raises:
             ValueError: another shape, or numbers that are not finite.
+            CalibrationError: such a step was never calibrated.
         """
         load = checked_array("Certifier.forces", forces, self.reader.surrogate.body.points.shape)
-        return self.read(self.reader.read(load, state or self.reader.surrogate.solve(load)))
+        return self.read(self.reader.read(load, state or self.reader.surrogate.solve(load), newton))
 
     def read(self, signs: Signs) -> Certificate:
-        """What signs say."""
-        known = self._known
+        """What signs say.
+
+        Raises:
+            CalibrationError: a step of Newton's method is among them, and such steps were never calibrated.
+        """
+        known, bounds = self._known if signs.newton is None else self._known.get("newton"), {}
+        if not known:
+            raise CalibrationError(
+                "Certifier.newton: expected a twin whose steps of Newton's method were calibrated, got none in its "
+                "card; calibrate it anew, with `stepped` at what is needed or more."
+            )
         place = int(np.searchsorted(known["edges"], signs.size, side="right"))
-        bounds = {}
         for error in ERRORS:
             factor = known["quantiles"][error][place]
-            is_known = factor is not None and np.isfinite(signs.residual)
-            bounds[error] = float(factor * np.exp(signs.row @ known["powers"][error])) if is_known else np.inf
-        return Certificate(**bounds, confidence=known["confidence"], signs=signs, reasons=tuple(self._reasons(signs)))
+            is_known = factor is not None and signs.is_finite
+            bounds[error] = float(factor * np.exp(signs.row(error) @ known["powers"][error])) if is_known else np.inf
+        reasons = tuple(self._reasons(signs))
+        return Certificate(**bounds, confidence=self._known["confidence"], signs=signs, reasons=reasons)
 
     def _reasons(self, signs: Signs) -> list[str]:
         limits, found = self._known["limits"], []
@@ -92,10 +104,21 @@ class Certifier:
             found.append("the prediction turns a cell inside out or has no balance to speak of")
         if signs.extent is not None and signs.extent > 1.0:
             found.append(f"the load lies {signs.extent:.2g} times as far out as the farthest of the training")
+        if signs.force_ratio is not None and signs.force_ratio > limits.get("force_ratio", np.inf):
+            found.append(f"a node bears {signs.force_ratio:.2g} times the largest force that it bore in training")
         if signs.size > limits["size"]:
             found.append(f"it moves a node by {1e3 * signs.size:.3g} mm, more than any calibrated load")
         if limits["residual"] < signs.residual < np.inf:
             found.append(f"forces of {signs.residual:.3g} times the load are out of balance, more than is usual")
         if limits["step"] < signs.step < np.inf:
             found.append(f"balance is {1e3 * signs.step:.3g} mm away, farther than is usual")
-        return found
+        return found if signs.newton is None else found + _unstable(signs.newton)
+
+
+def _unstable(step: NewtonStep) -> list[str]:
+    if not np.isfinite(step.mean):
+        return ["Newton's method finds no step from the prediction"]
+    if step.negative_pivots == 0:
+        return []
+    count = "an unknown number of" if step.negative_pivots is None else step.negative_pivots
+    return [f"the predicted state is unstable: its tangent has {count} negative pivots"]

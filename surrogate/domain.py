@@ -18,7 +18,8 @@ _LEAST_SPREAD = 1e-3  # of the largest: a direction hardly ever loaded must not 
 def with_domain(surrogate: Surrogate, data: DataSet) -> Surrogate:
     """The surrogate with the extent of its training loads: `SurrogateState.extent` is 1 at the farthest of them.
 
-    The measure is the root mean square of the network's coordinates, each in units of its spread over training.
+    The measure is the root mean square of the network's coordinates, each in units of its spread over training. What
+    the coordinates do not see is told by the largest force that each node has borne (`LinearMaps.largest_forces`).
 
     Args:
         surrogate: the surrogate.
@@ -31,5 +32,6 @@ def with_domain(surrogate: Surrogate, data: DataSet) -> Surrogate:
     reach = np.sqrt(((coordinates / spread) ** 2).mean(axis=1)).max()
     largest = np.linalg.norm(samples.displacements, axis=2).max()
     domain = {"reach": float(reach), "displacement_m": float(largest)}
-    maps = replace(surrogate.maps, spread=spread)
+    borne = np.linalg.norm(samples.forces, axis=2).max(axis=0)
+    maps = replace(surrogate.maps, spread=spread, largest_forces=borne)
     return Surrogate(surrogate.body, maps, surrogate.network, {**surrogate.card, "domain": domain})

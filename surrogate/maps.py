@@ -26,6 +26,7 @@ class LinearMaps:
         encode: (d, 3l); None for the identity.
         decode: (3n, e), m; None for the identity.
         spread: root mean square of each coordinate over the training loads, (d,); None where it was not measured.
+        largest_forces: largest force that each of these nodes bore in training, (l,), N; None likewise.
         error_modes: modes of `Discrepancy`, (3n, m); None where they were not measured.
         error_rest: its rest, (n,).
     """
@@ -37,6 +38,7 @@ class LinearMaps:
     encode: Floats | None = None
     decode: Floats | None = None
     spread: Floats | None = None
+    largest_forces: Floats | None = None
     error_modes: Floats | None = None
     error_rest: Floats | None = None
 

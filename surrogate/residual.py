@@ -115,16 +115,15 @@ class ElasticBody(nn.Module):
 
     def cell_stiffnesses(self, displacement: Tensor) -> Tensor:
         """Tangents of the cells at one state, (n, 3), metres: (cells, 3k, 3k), N/m, node by node."""
-        nodal = displacement[self.cells]
-        forces = torch.func.grad(lambda u: self._cell_energy(u).sum())
-        width = nodal.shape[1] * 3
-        columns = []
-        for entry in range(width):
-            unit = torch.zeros(width, dtype=nodal.dtype, device=nodal.device)
-            unit[entry] = 1.0
-            way = unit.reshape(1, -1, 3).expand_as(nodal)
-            columns.append(torch.func.jvp(forces, (nodal,), (way,))[1].flatten(1))
-        return torch.stack(columns, dim=2)
+        F = self.deformation_gradients(displacement[None])[0]
+        stress = torch.func.grad(lambda at: self._density(at).sum())
+        ways = torch.eye(9, dtype=F.dtype, device=F.device).reshape(9, 3, 3)
+        slopes = [torch.func.jvp(stress, (F,), (way.expand_as(F),))[1] for way in ways]
+        moduli = torch.stack(slopes, dim=-1).unflatten(-1, (3, 3)) * self.volumes[..., None, None, None, None]
+        cells, _, nodes, _ = self.gradients.shape
+        ahead = torch.einsum("cqijml,cqnl->cqjinm", moduli, self.gradients).reshape(cells, -1, 9 * nodes)
+        behind = self.gradients.transpose(1, 2).reshape(cells, nodes, -1)
+        return (behind @ ahead).reshape(cells, 3 * nodes, 3 * nodes)
 
     def stiffness(self, displacement: Tensor) -> csr_matrix:
         """The tangent at one state, (n, 3), metres: (3n, 3n), N/m, fixed nodes included, no following pressure."""
@@ -133,12 +132,6 @@ class ElasticBody(nn.Module):
         rows, columns = np.broadcast_arrays(unknowns[:, :, None], unknowns[:, None, :])
         size = 3 * self.nodes
         return coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size)).tocsr()
-
-    def _cell_energy(self, nodal: Tensor) -> Tensor:
-        """Strain energy of each cell, (cells,), for its nodal displacements, (cells, k, 3)."""
-        unit = torch.eye(3, dtype=nodal.dtype, device=nodal.device)
-        F = unit + torch.einsum("cki,cqkj->cqij", nodal, self.gradients)
-        return (self._density(F) * self.volumes).sum(dim=1)
 
     def residual(self, displacement: Tensor, forces: Tensor) -> Tensor:
         """Out-of-balance forces at the free nodes relative to the forces there, |R(u) - b| / |b|, (s,).

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
 from softtwin.reference.data.materials import MATERIALS
@@ -17,11 +18,32 @@ from .model import Surrogate, SurrogateState
 from .residual import ElasticBody
 
 Floats = NDArray[np.float64]
+Error = Literal["mean", "largest"]
 _LEAST, _MOST = 1e-300, 1e300
+_SOLVED = 1e-6  # of the right-hand side: what a step without pivoting may leave
 
 
 class CalibrationError(ValueError):
     """A certificate that cannot be given: too few samples, or none of this twin."""
+
+
+@dataclass(frozen=True)
+class NewtonStep:
+    """One step of Newton's method from a prediction, with the inertia of the tangent there.
+
+    Args:
+        mean: its mean nodal length, metres: near a stable equilibrium the error, but for what is quadratic in it;
+            infinite where there is no step because a cell is inside out or the tangent is singular.
+        largest: its largest nodal length, metres; likewise.
+        negative_pivots: of the tangent at the prediction: 0 where that is stable; None where they cannot be told.
+    """
+
+    mean: float
+    largest: float
+    negative_pivots: int | None
+
+
+_NO_STEP = NewtonStep(np.inf, np.inf, None)
 
 
 @dataclass(frozen=True)
@@ -30,27 +52,38 @@ class Signs:
 
     Args:
         extent: how far out the load lies: 1 at the farthest of the training; None where that was not measured.
+        force_ratio: largest ratio of a node's force to the largest that this node bore in training; None likewise.
         size: largest predicted displacement of a node, metres.
         residual: |R(u) - b| / |b| at the free nodes; infinite where a cell is inside out.
         step: mean nodal length of the linear step towards balance, metres: eta = |Q K(0)^-1 Q^T (R(u) - b)|, with Q the
             rotations of the nodes; infinite as above.
+        newton: a step of Newton's method; None where none was asked for.
     """
 
     extent: float | None
+    force_ratio: float | None
     size: float
     residual: float
     step: float
+    newton: NewtonStep | None = None
 
     @property
-    def logarithms(self) -> Floats:
-        """Of size, residual and step, (3,)."""
-        values = np.nan_to_num(np.array([self.size, self.residual, self.step]), nan=_MOST, posinf=_MOST)
-        return np.log(np.clip(values, _LEAST, _MOST))
+    def is_finite(self) -> bool:
+        """Whether anything can be read from them."""
+        return bool(np.isfinite(self.residual) and (self.newton is None or np.isfinite(self.newton.mean)))
 
-    @property
-    def row(self) -> Floats:
-        """One, and the logarithms, (4,): what fitted powers multiply."""
-        return np.concatenate([[1.0], self.logarithms])
+    def row(self, error: Error) -> Floats:
+        """One, and the logarithms of size, residual, step and Newton's step if there is one: fitted powers multiply it.
+
+        Args:
+            error: what they are wanted for, the mean or the largest nodal error.
+        """
+        values = [1.0, self.size, self.residual, self.step]
+        if self.newton is not None:
+            values.append(getattr(self.newton, error))
+        found = np.nan_to_num(np.array(values), nan=_MOST, posinf=_MOST)
+        found[1:] = np.log(np.clip(found[1:], _LEAST, _MOST))
+        return found
 
 
 class SignReader:
@@ -81,27 +114,66 @@ class SignReader:
 
     @cached_property
     def _factor(self) -> Any:
-        tangent = self._elastic.stiffness(torch.zeros(self.surrogate.body.points.shape, dtype=torch.float64)).tocsc()
-        own = np.flatnonzero(self._free)
-        options = {"SymmetricMode": True}
-        return splu(tangent[own][:, own], permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        return self._factored(torch.zeros(self.surrogate.body.points.shape, dtype=torch.float64))[0]
 
-    def read(self, forces: Floats, state: SurrogateState) -> Signs:
-        """What the prediction for nodal forces, (n, 3), newtons, shows of its error."""
-        shape = forces.shape
-        predicted = torch.from_numpy(np.where(self._free.reshape(shape), state.displacement, 0.0))
-        gap = self._elastic.internal_forces(predicted[None])[0].numpy() - forces
-        gap[~self._free.reshape(shape)] = 0.0
-        size, load = float(np.linalg.norm(state.displacement, axis=1).max()), float(np.linalg.norm(forces))
-        missing = float(np.linalg.norm(gap))
+    def _factored(self, displacement: torch.Tensor) -> tuple[Any, csc_matrix]:
+        """Factors of the tangent at a displacement, (n, 3), and the tangent of the free unknowns.
+
+        The diagonal is the pivot, so that the signs of U are those of D in L D L^T.
+        """
+        own = np.flatnonzero(self._free)
+        tangent = self._elastic.stiffness(displacement)[own].tocsc()[:, own]
+        options = {"SymmetricMode": True}
+        return splu(tangent, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options), tangent
+
+    def read(self, forces: Floats, state: SurrogateState, newton: bool = False) -> Signs:
+        """What the prediction for nodal forces, (n, 3), newtons, shows of its error.
+
+        Args:
+            forces: (n, 3), newtons.
+            state: the prediction for them.
+            newton: make a step of Newton's method too, for which the tangent at the prediction is factored.
+        """
+        is_free = self._free.reshape(forces.shape)
+        predicted = torch.from_numpy(np.where(is_free, state.displacement, 0.0))
+        gap = np.where(is_free, self._elastic.internal_forces(predicted[None])[0].numpy() - forces, 0.0)
+        ratio, size = self._force_ratio(forces), float(np.linalg.norm(state.displacement, axis=1).max())
+        load, missing = float(np.linalg.norm(forces)), float(np.linalg.norm(gap))
         if not np.isfinite(missing):
-            return Signs(state.extent, size, np.inf, np.inf)
-        turns = self._rotations(predicted)
-        step = np.zeros(forces.size)
-        step[self._free] = self._factor.solve(np.einsum("nji,nj->ni", turns, gap).ravel()[self._free])
-        length = float(np.linalg.norm(step.reshape(shape), axis=1).mean())  # turning back changes no length
+            return Signs(state.extent, ratio, size, np.inf, np.inf, _NO_STEP if newton else None)
+        turned = np.einsum("nji,nj->ni", self._rotations(predicted), gap)
+        step = self._lengths(self._factor.solve(turned.ravel()[self._free])).mean()  # turning back changes no length
         residual = missing / load if load > 0.0 else (np.inf if missing > 0.0 else 0.0)
-        return Signs(state.extent, size, residual, length)
+        newtons = self._newton_step(predicted, gap) if newton else None
+        return Signs(state.extent, ratio, size, residual, float(step), newtons)
+
+    def _newton_step(self, displacement: torch.Tensor, gap: Floats) -> NewtonStep:
+        try:
+            factor, tangent = self._factored(displacement)
+        except RuntimeError:  # exactly singular
+            return _NO_STEP
+        wanted = gap.ravel()[self._free]
+        step = factor.solve(wanted)
+        if not np.linalg.norm(tangent @ step - wanted) <= _SOLVED * np.linalg.norm(wanted):
+            return _NO_STEP
+        is_symmetric = np.array_equal(factor.perm_r, factor.perm_c)
+        pivots = int((factor.U.diagonal() < 0.0).sum()) if is_symmetric else None
+        lengths = self._lengths(step)
+        return NewtonStep(float(lengths.mean()), float(lengths.max()), pivots)
+
+    def _lengths(self, step: Floats) -> Floats:
+        """Nodal lengths, (n,), metres, of a field at the free unknowns."""
+        whole = np.zeros(len(self._free))
+        whole[self._free] = step
+        return np.linalg.norm(whole.reshape(-1, 3), axis=1)
+
+    def _force_ratio(self, forces: Floats) -> float | None:
+        maps = self.surrogate.maps
+        if maps.largest_forces is None:
+            return None
+        sizes = np.linalg.norm(forces[maps.loaded], axis=1)
+        with np.errstate(divide="ignore"):
+            return float(np.divide(sizes, maps.largest_forces, where=sizes > 0.0, out=np.zeros_like(sizes)).max())
 
     def _rotations(self, displacement: torch.Tensor) -> Floats:
         """Rotation of each node, (n, 3, 3): the polar factor of the mean deformation gradient of its cells."""

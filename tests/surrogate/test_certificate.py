@@ -80,6 +80,17 @@ def test_as_many_samples_keep_their_bounds_as_should(surrogate: Surrogate, data:
     assert found.outside <= 0.05 * found.samples
 
 
+def test_bounds_from_a_newton_step_are_kept_as_often_and_tighter(surrogate: Surrogate, data: DataSet) -> None:
+    """Three deviations of what chance leaves in a hundred samples that calibrate and 256 that judge."""
+    found, usual = (coverage(surrogate, data, newton=newton) for newton in (True, False))
+    assert found.newton and not usual.newton
+    assert abs(found.kept["mean"] - 0.9) < 3.0 * np.sqrt(0.09 / 256 + 0.09 / 100)
+    assert max(found.widths["mean"]) < max(usual.widths["mean"])
+    assert found.rank_correlation["mean"] > usual.rank_correlation["mean"]
+    assert found.step_correlation == usual.step_correlation
+    assert usual.step_correlation["mean"] > 0.85
+
+
 def test_a_higher_confidence_is_a_wider_bound(bare: Surrogate, data: DataSet, surrogate: Surrogate) -> None:
     force = loads(data, 1)[0]
     wide, narrow = (Certifier(calibrate(bare, data, confidence=c)).certify(force) for c in (0.97, 0.5))
@@ -151,6 +162,50 @@ def test_the_step_is_the_reference_s_from_the_tangent_at_rest(
     assert signs.size == np.linalg.norm(state.displacement, axis=1).max()
 
 
+def test_the_newton_step_is_the_reference_s_with_its_inertia(bare: Surrogate, data: DataSet, small: Body) -> None:
+    """From a prediction, and from a state that is pressed together so much that it is none to stay in."""
+    force, reader = loads(data, 1)[0], SignReader(bare)
+    pressed = np.zeros_like(small.points)
+    pressed[:, 0] = -0.3 * small.points[:, 0]
+    with Problem(small, PLAN.build_material()) as problem:
+        for displacement, is_stable in ((bare.solve(force).displacement, True), (pressed, False)):
+            gap = problem.internal_forces(displacement) - force
+            gap[small.fixed] = 0.0
+            step = np.linalg.norm(problem.apply_inverse(gap.ravel(), displacement).reshape(-1, 3), axis=1)
+            found = reader.read(force, SimpleNamespace(displacement=displacement, extent=None), newton=True).newton
+            np.testing.assert_allclose((found.mean, found.largest), (step.mean(), step.max()), rtol=1e-6)
+            assert found.negative_pivots == problem.negative_pivots(displacement)
+            assert (found.negative_pivots == 0) == is_stable
+
+
+def test_an_unstable_prediction_is_set_aside(surrogate: Surrogate, small: Body) -> None:
+    pressed = np.zeros_like(small.points)
+    pressed[:, 0] = -0.3 * small.points[:, 0]
+    state = SimpleNamespace(displacement=pressed, extent=0.5)
+    found = Certifier(surrogate).certify(np.zeros_like(small.points), state, newton=True)
+    assert found.signs.newton is not None and found.signs.newton.negative_pivots
+    assert f"unstable: its tangent has {found.signs.newton.negative_pivots} negative pivots" in " ".join(found.reasons)
+
+
+def test_a_prediction_inside_out_has_no_newton_step(surrogate: Surrogate, data: DataSet) -> None:
+    wrong = SimpleNamespace(displacement=-2.0 * data.body.points, extent=0.5)
+    found = Certifier(surrogate).certify(loads(data, 1)[0], wrong, newton=True)
+    assert found.mean == found.largest == np.inf and "finds no step" in found.reasons[-1]
+
+
+def test_a_node_that_bears_more_than_ever_is_told(surrogate: Surrogate, data: DataSet, small: Body) -> None:
+    """A load on one node alone."""
+    most = surrogate.maps.largest_forces
+    np.testing.assert_allclose(most, np.linalg.norm(data.samples("train").forces, axis=2).max(axis=0))
+    force, node = np.zeros_like(small.points), int(np.argmin(most))
+    limit = surrogate.card["certificate"]["limits"]["force_ratio"]
+    force[surrogate.maps.loaded[node], 2] = 1.5 * limit * most[node]
+    found = Certifier(surrogate).certify(force)
+    assert found.signs.force_ratio == pytest.approx(1.5 * limit)
+    assert f"a node bears {1.5 * limit:.2g} times the largest force that it bore in training" in found.reasons
+    assert "a node bears" not in " ".join(Certifier(surrogate).certify(force / 1.6).reasons)
+
+
 def test_a_turned_body_has_turned_nodes(bare: Surrogate, small: Body) -> None:
     import torch
 
@@ -171,6 +226,15 @@ def test_quantiles_are_those_of_crepes() -> None:
     np.testing.assert_array_equal([quantile(scores[bins == place], 0.9) for place in range(3)], expected)
 
 
+def test_draws_of_one_load_path_have_its_weight_together() -> None:
+    """Of ten paths nine must keep a bound of 90 %, however many draws a path has."""
+    paths = np.repeat(np.arange(10), [50, 1, 1, 1, 1, 1, 1, 1, 1, 50])
+    scores = paths.astype(float)
+    assert quantile(scores, 0.9, paths) == 9.0 and quantile(scores, 0.6, paths) == 6.0
+    assert quantile(scores, 0.9) == 9.0 and quantile(scores, 0.45) == 0.0
+    assert quantile(scores[paths < 8], 0.9, paths[paths < 8]) is None
+
+
 @pytest.mark.parametrize(("confidence", "count"), [(0.9, 9), (0.8, 4), (0.5, 1), (0.99, 99)])
 def test_how_many_samples_a_bound_needs(confidence: float, count: int) -> None:
     assert needed(confidence) == count
@@ -182,8 +246,30 @@ def test_how_many_samples_a_bound_needs(confidence: float, count: int) -> None:
 
 
 def test_too_few_samples_are_refused_with_how_many_are_needed(bare: Surrogate, data: DataSet) -> None:
-    with pytest.raises(CalibrationError, match=r"expected at least 999 accepted samples.*got 256 in the calibration"):
+    with pytest.raises(CalibrationError, match=r"at least 999 load paths .* of 0\.999 on.*got 256 paths in the calib"):
         calibrate(bare, data, confidence=0.999)
+
+
+def test_draws_along_few_load_paths_are_no_more_than_these(tmp_path: Path, small: Body) -> None:
+    """32 draws along eight paths make no bound of 90 %; along twelve they do, and the ranges are told."""
+    counts = {"train": 32, "validation": 16, "test": 8, "calibration": 32}
+    plan = replace(PLAN, samples=counts, block=8, ramp=4)
+    few = generate(tmp_path / "few.zarr", small, plan)
+    network = train(few, TrainingPlan(Reduced(modes=8, width=16), epochs=30))
+    with pytest.raises(CalibrationError, match=r"at least 9 load paths.*got 8 paths in the calibration"):
+        calibrate(network, few)
+    enough = generate(tmp_path / "enough.zarr", small, replace(plan, samples={**counts, "calibration": 48}))
+    entry = calibrate(network, enough).card["certificate"]
+    assert (entry["samples"], entry["load_paths"], entry["newton"]["samples"]) == (48, 12, 48)
+    singly = generate(tmp_path / "singly.zarr", small, replace(plan, ramp=1))
+    with pytest.warns(CalibrationWarning, match=r"drawn otherwise than those that were learned \(in ramp\)"):
+        calibrate(network, singly)
+
+
+def test_steps_that_were_never_calibrated_bound_nothing(bare: Surrogate, data: DataSet) -> None:
+    certifier = Certifier(calibrate(bare, data, stepped=0))
+    with pytest.raises(CalibrationError, match=r"Certifier\.newton: expected a twin whose steps"):
+        certifier.certify(loads(data, 1)[0], newton=True)
 
 
 @pytest.mark.parametrize("confidence", [0.0, 1.0, 90.0, float("nan")])
