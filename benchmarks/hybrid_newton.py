@@ -80,8 +80,8 @@ def reference_way(problem: Problem, network: Surrogate | None) -> Way:
         began = time.perf_counter()
         try:
             state = model.solve(load).equilibrium
-        except NotConverged:
-            return Found(None, time.perf_counter() - began)
+        except NotConverged as failure:
+            return Found(None, time.perf_counter() - began, len(failure.trace))
         seconds = time.perf_counter() - began
         return Found(state.displacement, seconds, state.iterations, state.factorisations, state.start == "proposal")
 

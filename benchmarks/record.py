@@ -1,10 +1,12 @@
-"""What every benchmark writes beside its table: machine, versions, time, figures, as JSON under results/."""
+"""What every benchmark writes beside its table: command, commit, machine, versions, figures, as JSON under results/."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
+import subprocess
+import sys
 import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -43,6 +45,19 @@ def machine() -> dict[str, Any]:
     }
 
 
+def command() -> str:
+    """What made a record: the script and what was asked of it; the rest are the script's own defaults."""
+    return " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+
+
+def commit() -> str:
+    """The state of the sources, with a mark where they differ from it."""
+    told = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=RESULTS.parent, capture_output=True, text=True, check=False
+    )
+    return told.stdout.strip() or "not known"
+
+
 def _gpu() -> str:
     try:
         import torch
@@ -62,7 +77,8 @@ def write(name: str, figures: Any) -> Path:
     """Write the figures of a benchmark; returns the file."""
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{name}.json"
-    record = {"benchmark": name, "date": time.strftime("%Y-%m-%d"), "machine": machine(), "figures": figures}
+    told = {"benchmark": name, "date": time.strftime("%Y-%m-%d"), "command": command(), "commit": commit()}
+    record = {**told, "machine": machine(), "figures": figures}
     path.write_text(json.dumps(record, indent=1, default=_plain) + "\n")
     print(f"written: {path.relative_to(RESULTS.parents[1])}")
     return path

@@ -186,7 +186,13 @@ def hybrid() -> None:
     found = recorded("hybrid_newton")
     if not found:
         return
-    head("hybrid_newton", "same state", "prediction picked", "iterations; factorisations", "ms: median; mean; 95 %")
+    head(
+        "hybrid_newton",
+        "same state",
+        "prediction picked",
+        "where solved: iterations; factorisations",
+        "ms: median; mean; 95 %",
+    )
     for key, f in found.items():
         row(
             key,
@@ -238,6 +244,34 @@ def certificates() -> None:
             *["-"] * 5,
             f"{ms['prediction']:.2f}; {ms['distance']:.3f}; {ms['solve']:.1f}",
         )
+
+
+def checked_network() -> None:
+    """One network: errors, Jacobian, bounds by size, and what its predictions save."""
+    found = recorded("checked_network")
+    if not found:
+        return
+    head("checked_network", "its own errors", "bounds", "same state", "iterations; factorisations", "ms: median; mean")
+    for body, f in found.items():
+        errors, bounds = f["errors"], f["bounds"]
+        row(
+            f"{body}: the network",
+            f"mean {1e3 * errors['nodal_error']['mean']:.3f} mm; relative "
+            f"{100 * errors['relative_error']['median']:.3f} (95 %: {100 * errors['relative_error']['p95']:.2f}) %; "
+            f"cosine {errors['gradient_cosine']['mean']:.5f}; Jacobian {100 * errors['jacobian_error']['mean']:.2f} %",
+            f"kept by {100 * bounds['kept']['mean']:.1f} %, by size "
+            + " / ".join(f"{100 * kept:.1f}" for kept in bounds["kept_in_range"]["mean"]),
+            *["-"] * 3,
+        )
+        for name, ways in f["solved"].items():
+            for way, told in ways.items():
+                row(
+                    f"{body}, {name}: {way}",
+                    *["-"] * 2,
+                    f"{told['same_state']} of {told['loads']}",
+                    f"{told['iterations']:.1f}; {told['factorisations']:.2f}",
+                    f"{told['median_ms']:.1f}; {told['mean_ms']:.1f}",
+                )
 
 
 def margins() -> None:
@@ -384,6 +418,7 @@ def print_all() -> None:
     prediction()
     hybrid()
     certificates()
+    checked_network()
     margins()
     active_rounds()
     throughput()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -68,7 +69,7 @@ def solver(config: Config) -> Callable[[str, int], int]:
 
 
 def solve_from_network(path: str, block: int, chosen: int) -> int:
-    """As `solve_block`, from the network of the block's round where that is kept.
+    """As `solve_block`, from the network of the block's round where that is kept, from rest with a warning where not.
 
     Args:
         path: folder of the data set.
@@ -77,8 +78,15 @@ def solve_from_network(path: str, block: int, chosen: int) -> int:
     """
     data = DataSet(path)
     draws, first = data.split_draws("active"), block * data.header["block"]
-    network = _network(Path(path), (first - draws.start) // chosen) if first in draws else None
-    if network is None or not (network / CARD).exists():
+    if first not in draws:
+        return solve_block(path, block)
+    network = _network(Path(path), (first - draws.start) // chosen)
+    if not (network / CARD).exists():
+        warnings.warn(
+            f"{network}: the network that chose these draws is not there; they are solved from rest, to the same "
+            "equilibria in more iterations.",
+            stacklevel=2,
+        )
         return solve_block(path, block)
     return solve_block(path, block, _opened(str(network), path, (network / CARD).stat().st_mtime_ns))
 

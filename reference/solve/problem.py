@@ -168,7 +168,7 @@ class Problem:
             for start in self._starts.candidates(wanted, guess, proposal, fallback):
                 attempt = self._newton.run(wanted, start.unknowns, eliminate=start.may_leave)
                 spent += attempt.iterations
-                if attempt.converged and (start.name != "proposal" or self._is_lowest(attempt, wanted)):
+                if attempt.converged and (start.name != "proposal" or self._is_lowest(attempt, wanted, stability)):
                     found = replace(attempt, iterations=spent)
                     return self._result(found, given, wanted, 1, start.name, stability=stability, trace=trace)
             if not fallback:
@@ -179,13 +179,19 @@ class Problem:
                 )
         return self._solve_in_steps(given, wanted, spent, stability, trace)
 
-    def _is_lowest(self, attempt: Attempt, load: DiscreteLoad) -> bool:
-        """Whether the energy is least where a stranger's proposal led: by the last tangent on the way, or the state's.
+    def _is_lowest(self, attempt: Attempt, load: DiscreteLoad, by_its_own: bool) -> bool:
+        """Whether the energy is least where a stranger's proposal led; True where nobody knows.
 
-        True where nobody knows.
+        Steps by a definite matrix are led away from a state that is no minimum: its own tangent K has a direction that
+        I - A^-1 K makes longer. Converged with such a matrix A it is one, but for errors that symmetry keeps at zero.
+
+        Args:
+            attempt: where the proposal led.
+            load: that acts there.
+            by_its_own: ask the tangent of the state itself, not the last one on the way.
         """
         tangent = self.system.tangent
-        if tangent.factorisations and tangent.linear.negative_pivots() == 0:
+        if not by_its_own and tangent.factorisations and tangent.linear.negative_pivots() == 0:
             return True
         return not tangent.negative_pivots(attempt.unknowns, load)
 

@@ -21,6 +21,7 @@ from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.data.summary import summary
 from softtwin.reference.differentiate import differentiate
 from softtwin.reference.generate import Plan, generate, plan_from_header
+from softtwin.reference.solve.problem import NewtonOptions
 
 from .conftest import run
 
@@ -76,6 +77,15 @@ def test_figures_are_those_of_the_samples(first: DataSet) -> None:
     assert found.extremes["most moved"] == draws[np.argmax(peaks)]
     assert found.extremes["least moved"] == draws[np.argmin(peaks)]
     assert found.jacobians is None and found.origin["seed"] == 0
+
+
+def test_draws_that_were_rejected_are_counted_by_reason(capsys, tmp_path: Path) -> None:
+    loads = LoadPlan(modes=4, amplitude=5.0)  # newtons a node: far too much for this beam
+    data = made(tmp_path, loads=loads, newton=NewtonOptions(max_load_steps=1))
+    found, rejected = summary(data), data.rejected()
+    assert sum(counts.get("not converged", 0) for counts in found.draws.values()) == len(rejected.draws) > 0
+    assert sum(counts.get("accepted", 0) for counts in found.draws.values()) == 14 - len(rejected.draws) > 0
+    assert f"{found.draws['test']['not converged']} not converged" in run(capsys, "data", "show", data.path)
 
 
 def test_missing_and_damaged_blocks_are_said_and_not_counted(capsys, first: DataSet, tmp_path: Path) -> None:

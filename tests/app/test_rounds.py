@@ -27,7 +27,8 @@ from softtwin.reference.data.merge import merge
 from softtwin.reference.data.summary import summary
 from softtwin.reference.generate import candidate_loads, plan_from_header, ramp_loads, solve_block
 from softtwin.surrogate.acquisition import most_telling, spread_out
-from softtwin.surrogate.signs import SignReader
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.signs import CalibrationError, SignReader
 from softtwin.surrogate.twin import load
 
 from .conftest import run
@@ -213,7 +214,28 @@ def test_a_start_from_a_network_ends_in_the_same_states(copied: Workspace) -> No
     np.testing.assert_array_equal(after["reason"], before["reason"])
 
 
+def test_a_block_whose_network_is_lost_is_solved_from_rest_and_that_is_said(copied: Workspace) -> None:
+    data = DataSet(copied.data)
+    draws = data.split_draws("active")
+    before = data.rows(draws)
+    shutil.rmtree(copied.root / "rounds" / "1")
+    drop_block(copied.data, draws.start // 2)
+    with pytest.warns(UserWarning, match=r"rounds/1: the network that chose these draws is not there"):
+        generate_stage(copied.root / "organ.toml")
+    after = DataSet(copied.data).rows(draws)
+    largest = np.abs(before["displacements"]).max()
+    np.testing.assert_allclose(after["displacements"], before["displacements"], atol=1e-6 * largest)
+
+
 # ---------------------------------------------------------------------- what is refused
+
+
+def test_rounds_of_a_material_that_torch_does_not_know_say_so(made: Workspace) -> None:
+    data = DataSet(made.data)
+    network = load(made.data.parent / "rounds" / "1", data.body)
+    network = Surrogate(network.body, network.maps, network.network, {**network.card, "data": {}})
+    with pytest.raises(CalibrationError, match="material"):
+        most_telling(network, [np.zeros((1, *data.body.points.shape))], 1, data.samples("train", 6).forces)
 
 
 def test_a_network_of_another_body_is_no_start(made: Workspace, copied: Workspace) -> None:

@@ -200,6 +200,26 @@ def test_a_proposal_that_is_worse_than_the_linear_response_is_left_aside(
     assert found.equilibrium.iterations == cold.equilibrium.iterations
 
 
+@pytest.mark.parametrize("stability", [True, False])
+def test_a_proposal_leads_a_column_to_its_bent_state_and_is_left_where_it_leads_to_the_straight_one(
+    stability: bool,
+) -> None:
+    """Beyond Euler's load the straight column is in balance, too, with two directions in which its energy falls."""
+    column = beam((10, 2, 2), (1.0, 0.1, 0.1), "hexahedron")
+    pressed, aside = np.zeros_like(column.points), np.zeros_like(column.points)
+    pressed[column.node_sets["tip"], 0] = -0.4 / len(column.node_sets["tip"])
+    aside[column.node_sets["tip"], 2] = 0.02 / len(column.node_sets["tip"])
+    with Problem(column, NeoHookean(5000.0, 0.4)) as problem:
+        straight = problem.solve(pressed)
+        nearly = straight.displacement * (1.0 + 1e-3 * column.points[:, :1])
+        led_back = problem.solve(pressed, proposal=nearly, stability=stability)
+        bent = problem.solve(pressed, proposal=problem.solve(pressed + aside).displacement, stability=stability)
+        assert straight.negative_pivots == problem.negative_pivots(led_back) == 2
+        assert problem.negative_pivots(bent) == 0
+    assert led_back.start != "proposal"
+    assert bent.start == "proposal" and bent.energy < straight.energy
+
+
 @pytest.mark.parametrize("proposal", [np.zeros((3, 3)), np.nan], ids=["shape", "nan"])
 def test_a_proposal_is_checked(box: Body, proposal: object) -> None:
     given = np.full_like(box.points, np.nan) if proposal is np.nan else proposal
