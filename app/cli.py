@@ -253,6 +253,15 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
 @click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
 @click.option("--align", type=click.Choice(["auto"]), help="Look for the pose in the first cloud that shows it.")
 @click.option(
+    "--marks",
+    nargs=2,
+    type=_EXISTING,
+    metavar="BODY CAMERA",
+    help="Named points that pull beside the clouds: on the organ at rest, and a folder with a file for each cloud, "
+    "named like it (or a file, for one cloud).",
+)
+@click.option("--landmark-deviation", type=float, help="Standard deviation of where --marks were found, metres.")
+@click.option(
     "--pose", type=click.Choice(["fixed", "unknown"]), help="Unknown: found with the forces, as after any start."
 )
 @click.option("--pose-turn", type=float, help="How far an unknown pose may turn from its start, degrees.")
@@ -273,6 +282,7 @@ def register(
     matrix: Path | None,
     landmarks: tuple[Path, Path] | None,
     align: str | None,
+    marks: tuple[Path, Path] | None,
     formats: tuple[str, ...],
     truth: Path | None,
     budget: float | None,
@@ -299,7 +309,7 @@ def register(
     if sum(given is not None for given in (matrix, landmarks or None, align)) > 1:
         raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
     options = _given(chosen)
-    start = Start(matrix, landmarks or None, align is not None)
+    start = Start(matrix, landmarks or None, align is not None, marks or None)
     if idle is not None and not watch:
         raise ConfigError("--idle: expected --watch beside it.")
     if watch:

@@ -251,6 +251,9 @@ class RegistrationSection(_Section):
     pressure: float = Field(0.0, description="on the whole boundary, pascals, following it (pneumoperitoneum)")
     pose_turn: Positive = Field(5.0, description="how far an unknown pose may turn from its start, degrees")
     pose_shift: Positive = Field(0.01, description="how far an unknown pose may shift from its start, metres")
+    landmark_deviation: Positive = Field(
+        0.002, description="standard deviation of where landmarks were found that pull beside the clouds, metres"
+    )
 
     @model_validator(mode="after")
     def _unknowns_can_be_found(self) -> RegistrationSection:

@@ -14,6 +14,7 @@ from softtwin.meshes.files import Unit
 
 from .config import ConfigError
 from .export import WRITTEN, Exporter
+from .landmarks import MarkFiles
 from .record import Recorder, counts, describe
 from .register import CloudFile, Scene, Start, check_any, check_budget, name_of, registered
 from .streams import Clock, Mailbox, WatchedFolder, fed
@@ -40,7 +41,11 @@ class Answer:
 
 
 def answers(
-    sequence: Sequence, box: Mailbox, budget: float | None = None, clock: Clock = time.monotonic
+    sequence: Sequence,
+    box: Mailbox,
+    budget: float | None = None,
+    clock: Clock = time.monotonic,
+    marks: MarkFiles | None = None,
 ) -> Iterator[Answer]:
     """The newest cloud registered, again and again, until the mailbox is closed.
 
@@ -50,6 +55,7 @@ def answers(
         budget: seconds from a cloud's coming to its answer: no step is begun after it, and the answer is the best so
             far; no limit if not given. One step of the reference can take longer than all of it.
         clock: seconds of the monotonic clock that the mailbox has, too.
+        marks: landmarks that pull beside clouds in files.
 
     Raises:
         ConfigError: a budget that is no positive number.
@@ -57,7 +63,7 @@ def answers(
     check_budget(budget)
     while (arrival := box.take()) is not None:
         until = np.inf if budget is None else arrival.at + budget
-        frame = registered(sequence, arrival.cloud, until)
+        frame = registered(sequence, arrival.cloud, until, marks)
         age = clock() - arrival.at
         yield Answer(frame, name_of(arrival.cloud), age, arrival.dropped, budget is not None and age > budget)
 
@@ -71,6 +77,7 @@ def register_live(
     camera: Camera = None,
     formats: tuple[str, ...] = WRITTEN,
     budget: float | None = None,
+    marks: MarkFiles | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
     """Register what comes into a mailbox and write each frame as it is found; returns the figures of all frames.
@@ -83,15 +90,18 @@ def register_live(
         camera: where the camera stands.
         formats: of the files of each frame; none are written for `()`, which is the quickest.
         budget: as for `answers`.
+        marks: landmarks that pull beside clouds in files.
         say: prints one line a frame.
 
     Raises:
         CloudError: none of the clouds could be registered at all; their frames are written all the same.
-        ConfigError: a budget that is no positive number.
+        ConfigError: a budget that is no positive number; landmarks that this twin cannot take.
     """
     sequence = Sequence(twin, zone, camera)
+    if marks is not None:
+        marks.check(twin)
     with Recorder(Exporter(twin, output, formats), zone) as recorder:
-        for answer in answers(sequence, box, budget):
+        for answer in answers(sequence, box, budget, marks=marks):
             figures = {"age_s": answer.age, "dropped": answer.dropped, "is_late": answer.is_late}
             say(describe(recorder.add(answer.frame, answer.cloud, **figures)))
     check_any(recorder.rows)
@@ -146,9 +156,13 @@ def watch_folder(
         source = WatchedFolder(folder, lambda path: CloudFile(path, scene.outside), idle=idle)
     except ValueError as error:
         raise ConfigError(f"--idle: {error}") from None
-    with scene.opened(start or Start(), say) as (twin, camera):
+    start = start or Start()
+    marks = scene.marks(start)
+    with scene.opened(start, say) as (twin, camera):
         twin.registrar()  # prepared before the first cloud is waited for
         chosen = formats or WRITTEN
-        rows = register_live(twin, fed(source), output, camera=camera, formats=chosen, budget=budget, say=say)
+        rows = register_live(
+            twin, fed(source), output, camera=camera, formats=chosen, budget=budget, marks=marks, say=say
+        )
     say(keeping_up(rows))
     return counts(rows)

@@ -63,6 +63,8 @@ class Recorder:
         """
         row: dict[str, Any] = {"frame": frame.number, "cloud": cloud, "verdict": frame.judgement.verdict.value}
         row |= {"reasons": list(frame.judgement.reasons), "seconds": frame.seconds, "files": [], **more}
+        if frame.landmarks:
+            row["landmarks"] = frame.landmarks
         if frame.registration is not None:
             truth = None if self.truth is None else self.truth[frame.number]
             row |= frame_figures(self.exporter.twin, frame.registration, truth)
@@ -196,6 +198,7 @@ def describe(row: Mapping[str, Any]) -> str:
         return line
     force, doubt = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
     line += f", cloud to surface {millimetres(row['rms_distance_m'])}"
+    line += f", {row['landmarks']} landmarks" if "landmarks" in row else ""
     line += (
         f", net force {force:.3f} ± {doubt:.3f} N" if force > 0.0 or doubt > 0.0 else ""
     )  # none where all forces are known

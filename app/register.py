@@ -20,14 +20,15 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import ContentError, FileError, Unit, read_cloud
-from softtwin.registration.pose import LandmarkFit, Pose, from_landmarks, read_landmarks, read_matrix
+from softtwin.registration.pose import Pose, read_matrix
 from softtwin.registration.unknowns import PosePrior
 
 from . import twin as twins
 from .config import ConfigError
 from .export import WRITTEN, Exporter
+from .landmarks import MarkFiles, camera_from_landmarks, describe_landmarks
 from .record import NOTICE as NOTICE
-from .record import Recorder, counts, describe, millimetres
+from .record import Recorder, counts, describe
 from .twin import Camera, Frame, Twin, coordinates_of
 
 Floats = NDArray[np.float64]
@@ -151,49 +152,22 @@ def camera_from_matrix(path: Path, coordinates: Coordinates) -> Pose:
     return pose if path.suffix.lower() == ".tfm" else Pose.from_matrix(coordinates.motion(pose.matrix))
 
 
-def camera_from_landmarks(body: Path, camera: Path, inside: Coordinates, clouds: Coordinates) -> LandmarkFit:
-    """The pose that brings landmarks on the body to those that the camera sees.
-
-    Args:
-        body: file of the landmarks on the body at rest.
-        camera: file of those in the camera's coordinates.
-        inside: coordinates of the body's files.
-        clouds: of the clouds' files.
-
-    Raises:
-        FileError, PoseError: a file that cannot be read, too few landmarks in common, or all in one line.
-    """
-    return from_landmarks(_landmarks(body, inside), _landmarks(camera, clouds))
-
-
-def _landmarks(path: Path, coordinates: Coordinates) -> dict[str, Floats]:
-    turned = read_landmarks(path, coordinates.unit, "lps")
-    if path.suffix.lower() in (".fcsv", ".json"):
-        return turned  # these say their axes themselves
-    return {name: coordinates.directions(place) for name, place in turned.items()}
-
-
-def describe_landmarks(fit: LandmarkFit) -> str:
-    """One line for a person: how many landmarks were used and what is left at them."""
-    worst = max(fit.residuals, key=lambda name: fit.residuals[name])
-    line = f"landmarks: {len(fit.residuals)} used, {millimetres(fit.rms, 1)} left, most at {worst} "
-    line += f"({millimetres(fit.residuals[worst], 1)})"
-    return line + (f"; without a partner: {', '.join(fit.unmatched)}" if fit.unmatched else "")
-
-
 @dataclass(frozen=True)
 class Start:
-    """Where a person says that the camera stands; at most one of the three.
+    """Where a person says that the camera stands, at most one of the first three, and what pulls beside the clouds.
 
     Args:
         matrix: file of the pose.
         landmarks: files of landmarks, on the body and in the camera's coordinates.
         align: look for the pose in the clouds.
+        marks: file of points on the body at rest, and the folder of where each cloud's frame shows them (or the file,
+            for one cloud); see `MarkFiles`.
     """
 
     matrix: Path | None = None
     landmarks: tuple[Path, Path] | None = None
     align: bool = False
+    marks: tuple[Path, Path] | None = None
 
 
 def register_files(
@@ -229,10 +203,12 @@ def register_files(
     scene = Scene.of(place, options, unit)
     clouds = find_clouds(names, scene.outside)
     positions = None if truth is None else read_truth(truth, len(clouds), scene.home.body, scene.inside)
-    with scene.opened(start or Start(), say) as (twin, camera):
+    start = start or Start()
+    marks = scene.marks(start, [cloud.path for cloud in clouds])
+    with scene.opened(start, say) as (twin, camera):
         chosen = formats or WRITTEN
         rows = register_clouds(
-            twin, clouds, output, camera=camera, truth=positions, formats=chosen, budget=budget, say=say
+            twin, clouds, output, camera=camera, truth=positions, formats=chosen, budget=budget, marks=marks, say=say
         )
     return counts(rows)
 
@@ -268,6 +244,18 @@ class Scene:
         home = twins.find_twin(place)
         inside = coordinates_of(twins.with_options(home.config, dict(options)))
         return cls(home, options, inside, replace(inside, unit=unit or inside.unit))
+
+    def marks(self, start: Start, clouds: Sequence[Path] | None = None) -> MarkFiles | None:
+        """What pulls beside the clouds; None where nothing was given.
+
+        Args:
+            start: what a person has given.
+            clouds: files of all clouds; None where they are yet to come.
+
+        Raises:
+            ConfigError, FileError: see `MarkFiles.read`.
+        """
+        return None if start.marks is None else MarkFiles.read(*start.marks, self.inside, self.outside, clouds)
 
     @contextmanager
     def opened(self, start: Start, say: Callable[[str], None]) -> Iterator[tuple[Twin, Camera]]:
@@ -314,6 +302,7 @@ def register_clouds(
     truth: Floats | None = None,
     formats: tuple[str, ...] = WRITTEN,
     budget: float | None = None,
+    marks: MarkFiles | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
     """Register a sequence and write each frame as it is found; returns the figures of all frames.
@@ -327,21 +316,24 @@ def register_clouds(
         truth: true node positions of each frame, (frames, n, 3), metres, to state errors.
         formats: of the files of each frame.
         budget: as for `register_files`.
+        marks: landmarks that pull beside clouds in files.
         say: prints one line a frame.
 
     Raises:
         CloudError: none of the clouds could be registered at all; their frames are written all the same.
-        ConfigError: a budget that is no positive number.
+        ConfigError: a budget that is no positive number; landmarks that this twin cannot take.
     """
     check_budget(budget)
     sequence = twins.Sequence(twin, zone, camera)
+    if marks is not None:
+        marks.check(twin)
     with (
         Recorder(Exporter(twin, output, formats), zone, truth) as recorder,
         tqdm(total=len(clouds), desc="registering", unit="frame", disable=None) as bar,
     ):
         for cloud in clouds:
             until = math.inf if budget is None else time.monotonic() + budget
-            row = recorder.add(registered(sequence, cloud, until), name_of(cloud))
+            row = recorder.add(registered(sequence, cloud, until, marks), name_of(cloud))
             with tqdm.external_write_mode():
                 say(describe(row))
             bar.update()
@@ -378,18 +370,25 @@ def name_of(cloud: CloudFile | ArrayLike) -> str:
     return cloud.path.name if isinstance(cloud, CloudFile) else ""
 
 
-def registered(sequence: twins.Sequence, cloud: CloudFile | ArrayLike, until: float = math.inf) -> Frame:
-    """The next frame of a sequence; refused, with the reason, where its file cannot be read.
+def registered(
+    sequence: twins.Sequence,
+    cloud: CloudFile | ArrayLike,
+    until: float = math.inf,
+    marks: MarkFiles | None = None,
+) -> Frame:
+    """The next frame of a sequence; refused, with the reason, where its file or its landmarks' cannot be read.
 
     Args:
         sequence: the sequence.
         cloud: a file, or points (p, 3) in metres.
         until: as for `Sequence.register`.
+        marks: landmarks that pull beside clouds in files.
     """
     if not isinstance(cloud, CloudFile):
         return sequence.register(cloud, until)
     try:
         points = cloud.read()
+        landmarks = None if marks is None else marks.of(cloud.path)
     except FileError as error:  # it could be read a moment ago, or holds nothing to register
         return sequence.refuse(str(error).removeprefix(f"{cloud.path}: "))  # the frame says which file it is
-    return sequence.register(points, until)
+    return sequence.register(points, until, landmarks)

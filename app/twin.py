@@ -39,6 +39,7 @@ from softtwin.registration.registrar import (
     options_for,
     prepare,
 )
+from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.rigid import align
 from softtwin.registration.thinning import thinned
 from softtwin.registration.unknowns import PosePrior
@@ -63,6 +64,10 @@ Camera = Pose | PosePrior | Literal["align"] | None
 is first looked for in the clouds themselves, None for clouds in the coordinates of the body at rest."""
 
 
+Landmarks = tuple[ArrayLike, ArrayLike]
+"""Points on the observed side at rest, and where the same points were found, (l, 3) each, metres."""
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One cloud of a sequence.
@@ -73,6 +78,7 @@ class Frame:
         registration: what was found; None where the cloud cannot be registered at all.
         seconds: wall time, that of a search for the pose included.
         cloud: points that were used, after thinning, (p, 3), metres; None as above.
+        landmarks: how many pulled beside the cloud.
     """
 
     number: int
@@ -80,6 +86,7 @@ class Frame:
     registration: Registration | None
     seconds: float
     cloud: Floats | None = None
+    landmarks: int = 0
 
 
 class Twin:
@@ -213,8 +220,8 @@ class Twin:
         start: Registration | None = None,
         camera: Camera = None,
         *,
-        landmarks: tuple[ArrayLike, ArrayLike] | None = None,
-        landmark_deviation: float = 2e-3,
+        landmarks: Landmarks | None = None,
+        landmark_deviation: float | None = None,
     ) -> Registration:
         """The forces and the state that explain a cloud, with a verdict on them.
 
@@ -226,7 +233,8 @@ class Twin:
             camera: where the camera stands.
             landmarks: points on the observed side at rest, and where the same points were found, in the cloud's
                 coordinates, (l, 3) each, metres: they pull beside the cloud.
-            landmark_deviation: standard deviation of each coordinate of where they were found, metres.
+            landmark_deviation: standard deviation of each coordinate of where they were found, metres; what the
+                configuration says if not given.
 
         Raises:
             ConfigError: no such zone; landmarks beside a contact of unknown place.
@@ -238,20 +246,18 @@ class Twin:
             camera = self.aligned(cloud)
 
         def run(registrar: Engine, points: Floats) -> Registration:
-            if landmarks is None:
-                return registrar.register(points, start)
-            if isinstance(registrar, ContactRegistrar):
-                raise ConfigError("landmarks: expected none beside a contact of unknown place, got some.")
-            places = np.asarray(landmarks[1], dtype=np.float64)
-            if isinstance(camera, Pose) and places.ndim == 2 and places.shape[1] == 3:
-                places = camera.inverse().apply(places)
-            marks = Marks.of(registrar.observed, landmarks[0], places, landmark_deviation)
-            return registrar.marked(marks).register(points, start)
+            return self._marked(registrar, landmarks, landmark_deviation, camera).register(points, start)
 
         return self._posed_result(cloud, zone, camera, run)
 
     def follow(
-        self, cloud: ArrayLike, zone: str | None, last: Registration | None, camera: Camera, until: float = np.inf
+        self,
+        cloud: ArrayLike,
+        zone: str | None,
+        last: Registration | None,
+        camera: Camera,
+        until: float = np.inf,
+        landmarks: Landmarks | None = None,
     ) -> Registration:
         """A cloud registered from the last frame, and from rest where that is not accepted; see `Registrar.follow`.
 
@@ -261,12 +267,36 @@ class Twin:
             last: result of the last usable frame.
             camera: where the camera stands.
             until: no step is begun after this time of the monotonic clock, seconds.
+            landmarks: as for `register`.
         """
 
         def run(registrar: Engine, points: Floats) -> Registration:
-            return (registrar.limited(until) if until < np.inf else registrar).follow(points, last)
+            limited = registrar.limited(until) if until < np.inf else registrar
+            return self._marked(limited, landmarks, None, camera).follow(points, last)
 
         return self._posed_result(cloud, zone, camera, run)
+
+    def _marked(
+        self, registrar: Engine, landmarks: Landmarks | None, deviation: float | None, camera: Camera
+    ) -> Engine:
+        """What registers with landmarks beside the cloud; as it is where there are none."""
+        if landmarks is None:
+            return registrar
+        registrar = _takes_marks(registrar)
+        places = np.asarray(landmarks[1], dtype=np.float64)
+        if isinstance(camera, Pose) and places.ndim == 2 and places.shape[1] == 3:
+            places = camera.inverse().apply(places)
+        wide = self.config.registration.landmark_deviation if deviation is None else deviation
+        return registrar.marked(Marks.of(registrar.observed, landmarks[0], places, wide))
+
+    @property
+    def observed(self) -> SurfaceDistance:
+        """The side that a camera sees, on which landmarks lie.
+
+        Raises:
+            ConfigError: a contact of unknown place is asked for, which takes no landmarks.
+        """
+        return _takes_marks(self.registrar()).observed
 
     def _posed_result(
         self, cloud: ArrayLike, zone: str | None, camera: Camera, run: Callable[[Engine, Floats], Registration]
@@ -431,24 +461,29 @@ class Sequence:
         self._count = 0
         twin.registrar(zone)  # a zone that is not there is said before the first cloud
 
-    def register(self, cloud: ArrayLike, until: float = np.inf) -> Frame:
+    def register(self, cloud: ArrayLike, until: float = np.inf, landmarks: Landmarks | None = None) -> Frame:
         """The next frame; refused, with the reason, where the cloud cannot be registered.
 
         Args:
             cloud: (p, 3), metres.
             until: no step is begun after this time of the monotonic clock, seconds: the result is the best so far.
+            landmarks: as for `Twin.register`.
+
+        Raises:
+            ConfigError, ValueError: landmarks that the twin cannot take.
         """
         begin = time.perf_counter()
         points = self._thinned(cloud)
         try:
             if self.camera == "align":
                 self.camera = self.twin.aligned(points)
-            result = self.twin.follow(points, self.zone, self._last, self.camera, until)
+            result = self.twin.follow(points, self.zone, self._last, self.camera, until, landmarks)
         except (CloudError, NotConverged) as error:
             return self.refuse(str(error), time.perf_counter() - begin)
         if result.judgement.is_usable:
             self._last = result
-        return Frame(self._next(), result.judgement, result, time.perf_counter() - begin, points)
+        count = 0 if landmarks is None else len(np.asarray(landmarks[0]))
+        return Frame(self._next(), result.judgement, result, time.perf_counter() - begin, points, count)
 
     def _thinned(self, cloud: ArrayLike) -> Floats:
         """Once for all that is tried with it; what is no cloud is left for the registrar to refuse."""
@@ -469,6 +504,12 @@ class Sequence:
     def _next(self) -> int:
         self._count += 1
         return self._count - 1
+
+
+def _takes_marks(registrar: Engine) -> Registrar | HybridRegistrar:
+    if isinstance(registrar, ContactRegistrar):
+        raise ConfigError("landmarks: expected none beside a contact of unknown place, got some.")
+    return registrar
 
 
 def _options(section: RegistrationSection, suited: RegistrationOptions) -> RegistrationOptions:

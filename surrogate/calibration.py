@@ -94,10 +94,11 @@ def calibrate(
         **_bounds((shown_before, errors_before), (shown, errors), paths, confidence),
         "limits": {
             name: _limit([getattr(signs, name) for signs in shown], share)
-            for name, share in (("size", 1.0), ("residual", _USUAL), ("step", _USUAL), ("force_ratio", _USUAL))
-            if getattr(shown[0], name) is not None
+            for name, share in (("size", 1.0), ("residual", _USUAL), ("step", _USUAL))
         },
     }
+    if shown[0].load is not None:
+        entry["limits"]["load"] = _usual_load(shown_before, shown, confidence)
     if len(np.unique(paths[:stepped])) >= needed(confidence):
         before, after = (_seen(reader, data, _first(samples, stepped), newton=True) for samples in (fitted, held))
         entry["newton"] = _bounds(before, after, paths[:stepped], confidence)
@@ -288,25 +289,57 @@ def _fitted(shown: list[Signs], found: dict[str, Floats], error: Error, confiden
 
     Least squares would follow the few predictions that are far from any equilibrium, whose steps mean little: bounds by
     a Newton step were a quarter wider (beam under modal loads).
-
-    Source: Koenker and Bassett 1978; as a linear programme.
     """
     errors, rows = found[error], np.stack([signs.row(error) for signs in shown])
     usable = np.array([signs.is_finite for signs in shown]) & (errors > 0.0)
     if not usable.any():
         return np.eye(rows.shape[1])[-1]
-    rows = rows[usable, 1:]
+    return _quantile_regression(rows[usable, 1:], np.log(errors[usable]), confidence)
+
+
+def _quantile_regression(rows: Floats, values: Floats, share: float) -> Floats:
+    """Intercept and slopes, (k + 1,), of the plane over rows, (s, k), that such a share of values, (s,), lies below.
+
+    Source: Koenker and Bassett 1978; as a linear programme.
+    """
     centre, spread = rows.mean(axis=0), rows.std(axis=0) + 1e-12
     scaled = np.column_stack([np.ones(len(rows)), (rows - centre) / spread])
     count, width = scaled.shape
     solved = linprog(
-        np.concatenate([np.zeros(width), np.full(count, confidence), np.full(count, 1.0 - confidence)]),
+        np.concatenate([np.zeros(width), np.full(count, share), np.full(count, 1.0 - share)]),
         A_eq=np.hstack([scaled, np.eye(count), -np.eye(count)]),
-        b_eq=np.log(errors[usable]),
+        b_eq=values,
         bounds=[(None, None)] * width + [(0.0, None)] * (2 * count),
     )
-    powers = solved.x[1:width] / spread
-    return np.concatenate([[solved.x[0] - powers @ centre], powers])
+    slopes = solved.x[1:width] / spread
+    return np.concatenate([[solved.x[0] - slopes @ centre], slopes])
+
+
+def _usual_load(before: list[Signs], seen: list[Signs], confidence: float) -> dict[str, Any]:
+    """How far out loads lie among those on their nodes, by the number of components that they act on.
+
+    Args:
+        before: signs that the dependence on the number is fitted to; where these are few it is left out.
+        seen: those that the limit is taken of.
+        confidence: quantile that is fitted.
+
+    Returns:
+        `powers` of the logarithm of the number, the highest first, and `limit` of what they leave of the distance's.
+    """
+
+    def told(signs: list[Signs]) -> tuple[Floats, Floats]:
+        given = np.array([each.load for each in signs if each.load is not None and each.load[1]], dtype=np.float64)
+        distances, counts = given.reshape(-1, 2).T
+        return np.log(np.maximum(distances, 1e-300)), np.log(np.maximum(counts, 1.0))
+
+    distances, counts = told(before)
+    fitted = np.zeros(1)
+    if len(distances) >= _A_RANGE and np.ptp(counts) > 0.0:
+        fitted = _quantile_regression(counts[:, None] ** [1, 2], distances, confidence)
+    powers = fitted[::-1]
+    distances, counts = told(seen)
+    left = distances - np.polyval(powers, counts)
+    return {"powers": powers.tolist(), "limit": _limit(left.tolist(), _USUAL) if len(left) else 0.0}
 
 
 def quantile(scores: Floats, confidence: float, paths: Ints | None = None) -> float | None:

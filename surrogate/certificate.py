@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -104,8 +105,9 @@ class Certifier:
             found.append("the prediction turns a cell inside out or has no balance to speak of")
         if signs.extent is not None and signs.extent > 1.0:
             found.append(f"the load lies {signs.extent:.2g} times as far out as the farthest of the training")
-        if signs.force_ratio is not None and signs.force_ratio > limits.get("force_ratio", np.inf):
-            found.append(f"a node bears {signs.force_ratio:.2g} times the largest force that it bore in training")
+        away = usual_ratio(signs, limits.get("load"))
+        if away is not None and away > 1.0:
+            found.append(f"it lies {away:.2g} times as far out as is usual among loads on the nodes that it acts on")
         if signs.size > limits["size"]:
             found.append(f"it moves a node by {1e3 * signs.size:.3g} mm, more than any calibrated load")
         if limits["residual"] < signs.residual < np.inf:
@@ -113,6 +115,20 @@ class Certifier:
         if limits["step"] < signs.step < np.inf:
             found.append(f"balance is {1e3 * signs.step:.3g} mm away, farther than is usual")
         return found if signs.newton is None else found + _unstable(signs.newton)
+
+
+def usual_ratio(signs: Signs, known: Mapping[str, Any] | None) -> float | None:
+    """How far out a load lies among those on its nodes, over what is usual for so many; None where that is not known.
+
+    Args:
+        signs: of a prediction.
+        known: powers of the number of components, and the limit of what they leave, as `calibrate` found them.
+    """
+    if signs.load is None or known is None or signs.load[1] == 0:
+        return None
+    distance, count = signs.load
+    usual = np.polyval(known["powers"], np.log(count)) + known["limit"]
+    return float(distance / np.exp(usual))
 
 
 def _unstable(step: NewtonStep) -> list[str]:

@@ -26,7 +26,8 @@ class LinearMaps:
         encode: (d, 3l); None for the identity.
         decode: (3n, e), m; None for the identity.
         spread: root mean square of each coordinate over the training loads, (d,); None where it was not measured.
-        largest_forces: largest force that each of these nodes bore in training, (l,), N; None likewise.
+        load_modes: directions that the training loads spread in, each as long as they do, (3l, q), N; None likewise.
+        load_rest: mean square of a component of force that these leave out, (1,), N^2; None likewise.
         error_modes: modes of `Discrepancy`, (3n, m); None where they were not measured.
         error_rest: its rest, (n,).
     """
@@ -38,7 +39,8 @@ class LinearMaps:
     encode: Floats | None = None
     decode: Floats | None = None
     spread: Floats | None = None
-    largest_forces: Floats | None = None
+    load_modes: Floats | None = None
+    load_rest: Floats | None = None
     error_modes: Floats | None = None
     error_rest: Floats | None = None
 

@@ -14,6 +14,7 @@ from scipy.sparse.linalg import splu
 
 from softtwin.reference.data.materials import MATERIALS
 
+from .domain import load_distance
 from .model import Surrogate, SurrogateState
 from .residual import ElasticBody
 
@@ -52,7 +53,8 @@ class Signs:
 
     Args:
         extent: how far out the load lies: 1 at the farthest of the training; None where that was not measured.
-        force_ratio: largest ratio of a node's force to the largest that this node bore in training; None likewise.
+        load: how far out it lies among the training loads on the nodes that it acts on, and the number of components of
+            force there; None likewise (`load_distance`).
         size: largest predicted displacement of a node, metres.
         residual: |R(u) - b| / |b| at the free nodes; infinite where a cell is inside out.
         step: mean nodal length of the linear step towards balance, metres: eta = |Q K(0)^-1 Q^T (R(u) - b)|, with Q the
@@ -61,7 +63,7 @@ class Signs:
     """
 
     extent: float | None
-    force_ratio: float | None
+    load: tuple[float, int] | None
     size: float
     residual: float
     step: float
@@ -137,15 +139,15 @@ class SignReader:
         is_free = self._free.reshape(forces.shape)
         predicted = torch.from_numpy(np.where(is_free, state.displacement, 0.0))
         gap = np.where(is_free, self._elastic.internal_forces(predicted[None])[0].numpy() - forces, 0.0)
-        ratio, size = self._force_ratio(forces), float(np.linalg.norm(state.displacement, axis=1).max())
+        away, size = load_distance(self.surrogate, forces), float(np.linalg.norm(state.displacement, axis=1).max())
         load, missing = float(np.linalg.norm(forces)), float(np.linalg.norm(gap))
         if not np.isfinite(missing):
-            return Signs(state.extent, ratio, size, np.inf, np.inf, _NO_STEP if newton else None)
+            return Signs(state.extent, away, size, np.inf, np.inf, _NO_STEP if newton else None)
         turned = np.einsum("nji,nj->ni", self._rotations(predicted), gap)
         step = self._lengths(self._factor.solve(turned.ravel()[self._free])).mean()  # turning back changes no length
         residual = missing / load if load > 0.0 else (np.inf if missing > 0.0 else 0.0)
         newtons = self._newton_step(predicted, gap) if newton else None
-        return Signs(state.extent, ratio, size, residual, float(step), newtons)
+        return Signs(state.extent, away, size, residual, float(step), newtons)
 
     def _newton_step(self, displacement: torch.Tensor, gap: Floats) -> NewtonStep:
         try:
@@ -166,14 +168,6 @@ class SignReader:
         whole = np.zeros(len(self._free))
         whole[self._free] = step
         return np.linalg.norm(whole.reshape(-1, 3), axis=1)
-
-    def _force_ratio(self, forces: Floats) -> float | None:
-        maps = self.surrogate.maps
-        if maps.largest_forces is None:
-            return None
-        sizes = np.linalg.norm(forces[maps.loaded], axis=1)
-        with np.errstate(divide="ignore"):
-            return float(np.divide(sizes, maps.largest_forces, where=sizes > 0.0, out=np.zeros_like(sizes)).max())
 
     def _rotations(self, displacement: torch.Tensor) -> Floats:
         """Rotation of each node, (n, 3, 3): the polar factor of the mean deformation gradient of its cells."""

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from softtwin.app.config import Config, ConfigError
+from softtwin.app.landmarks import camera_from_landmarks
 from softtwin.app.record import RECORD, describe, finite, millimetres
 from softtwin.app.register import (
     CloudFile,
-    camera_from_landmarks,
     camera_from_matrix,
     camera_of,
     find_clouds,
@@ -312,6 +312,7 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
         "pose": "fixed",
         "pose_turn": 3.0,
         "pose_shift": 0.02,
+        "landmark_deviation": 1e-3,
     }
     flags = [word for name, value in wanted.items() for word in (f"--{name.replace('_', '-')}", value)]
     register(capsys, mesh_folder, mesh_cloud, *flags, "--noise-known", "--format", "ply", "--format", "stl")

@@ -21,7 +21,7 @@ from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.generate import Plan, generate, ramp_loads
 from softtwin.reference.solve.problem import Problem
 from softtwin.surrogate.calibration import CalibrationWarning, calibrate, coverage, needed, quantile
-from softtwin.surrogate.certificate import Certifier
+from softtwin.surrogate.certificate import Certifier, usual_ratio
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
@@ -71,13 +71,17 @@ def loads(data: DataSet, count: int) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("error", ["mean", "largest"])
 def test_as_many_samples_keep_their_bounds_as_should(surrogate: Surrogate, data: DataSet, error: str) -> None:
-    """Of 256 with a bound for 90 %: three standard deviations of what chance in both splits leaves."""
+    """Of 256 with a bound for 90 %: three standard deviations of what chance in both splits leaves.
+
+    Three of the limits set one in a hundred aside each, and the largest size of the calibration one in 257.
+    """
     found = coverage(surrogate, data)
     assert abs(found.kept[error] - 0.9) < 3.0 * np.sqrt(2 * 0.09 / 256)
     assert sum(found.in_range) == found.samples and len(found.in_range) == 4
     assert found.rank_correlation[error] > 0.85
     assert all(1.0 < width < 4.0 for width in found.widths[error])
-    assert found.outside <= 0.05 * found.samples
+    share = 0.03 + 1.0 / 257.0
+    assert found.outside / found.samples < share + 3.0 * np.sqrt(2.0 * share / 256)
 
 
 def test_bounds_from_a_newton_step_are_kept_as_often_and_tighter(surrogate: Surrogate, data: DataSet) -> None:
@@ -86,9 +90,23 @@ def test_bounds_from_a_newton_step_are_kept_as_often_and_tighter(surrogate: Surr
     assert found.newton and not usual.newton
     assert abs(found.kept["mean"] - 0.9) < 3.0 * np.sqrt(0.09 / 256 + 0.09 / 100)
     assert max(found.widths["mean"]) < max(usual.widths["mean"])
-    assert found.rank_correlation["mean"] > usual.rank_correlation["mean"]
     assert found.step_correlation == usual.step_correlation
     assert usual.step_correlation["mean"] > 0.85
+
+
+def test_where_a_prediction_is_stable_its_newton_step_is_nearly_its_error(surrogate: Surrogate, data: DataSet) -> None:
+    """Elsewhere the step leads to another state, or nowhere: a third of so rough a network's predictions."""
+    certifier, samples = Certifier(surrogate), data.samples("test")
+    given = [certifier.certify(load, newton=True) for load in loads(data, len(samples))]
+    stable = np.array([each.signs.newton is not None and each.signs.newton.negative_pivots == 0 for each in given])
+    states = np.stack([surrogate.solve(load).displacement for load in loads(data, len(samples))])
+    errors = np.linalg.norm(states - samples.displacements, axis=2).mean(axis=1)[stable]
+    newtons, linear = (
+        np.array([step(each.signs) for each in given])[stable] / errors
+        for step in (lambda signs: signs.newton.mean, lambda signs: signs.step)
+    )
+    assert stable.mean() > 0.5
+    assert np.median(np.abs(np.log(newtons))) < min(0.2, 0.5 * np.median(np.abs(np.log(linear))))
 
 
 def test_a_higher_confidence_is_a_wider_bound(bare: Surrogate, data: DataSet, surrogate: Surrogate) -> None:
@@ -193,17 +211,34 @@ def test_a_prediction_inside_out_has_no_newton_step(surrogate: Surrogate, data: 
     assert found.mean == found.largest == np.inf and "finds no step" in found.reasons[-1]
 
 
-def test_a_node_that_bears_more_than_ever_is_told(surrogate: Surrogate, data: DataSet, small: Body) -> None:
-    """A load on one node alone."""
-    most = surrogate.maps.largest_forces
-    np.testing.assert_allclose(most, np.linalg.norm(data.samples("train").forces, axis=2).max(axis=0))
-    force, node = np.zeros_like(small.points), int(np.argmin(most))
-    limit = surrogate.card["certificate"]["limits"]["force_ratio"]
-    force[surrogate.maps.loaded[node], 2] = 1.5 * limit * most[node]
-    found = Certifier(surrogate).certify(force)
-    assert found.signs.force_ratio == pytest.approx(1.5 * limit)
-    assert f"a node bears {1.5 * limit:.2g} times the largest force that it bore in training" in found.reasons
-    assert "a node bears" not in " ".join(Certifier(surrogate).certify(force / 1.6).reasons)
+def test_a_load_far_out_among_those_on_its_nodes_is_told(surrogate: Surrogate, data: DataSet) -> None:
+    """A patch of three nodes: far less than what the whole body bears, and three times what these ever bore."""
+    maps, forces = surrogate.maps, data.samples("train").forces
+    patch = np.argsort(np.linalg.norm(forces, axis=2).max(axis=0))[:3]
+    draw = int(np.argmax(np.linalg.norm(forces[:, patch], axis=(1, 2))))
+    load = np.zeros_like(data.body.points)
+    load[maps.loaded[patch]] = forces[draw, patch]
+    spread = maps.load_modes @ maps.load_modes.T + maps.load_rest * np.eye(len(maps.load_modes))
+    own = np.flatnonzero(load[maps.loaded].ravel())
+    flat = load[maps.loaded].ravel()[own]
+    expected = np.sqrt(flat @ np.linalg.solve(spread[np.ix_(own, own)], flat))
+    certifier = Certifier(surrogate)
+    found = certifier.certify(load)
+    assert found.signs.load == (pytest.approx(expected), len(own))
+    known = surrogate.card["certificate"]["limits"]["load"]
+    ratio = usual_ratio(found.signs, known)
+    assert ratio is not None and "among loads on the nodes" not in " ".join(
+        certifier.certify(0.99 / ratio * load).reasons
+    )
+    far = certifier.certify(3.0 / ratio * load)
+    assert "it lies 3 times as far out as is usual among loads on the nodes that it acts on" in far.reasons
+    assert usual_ratio(certifier.certify(np.zeros_like(load)).signs, known) is None
+
+
+def test_few_of_the_held_out_loads_are_far_out_among_those_on_their_nodes(surrogate: Surrogate, data: DataSet) -> None:
+    known = surrogate.card["certificate"]["limits"]["load"]
+    given = [usual_ratio(Certifier(surrogate).certify(load).signs, known) for load in loads(data, 16)]
+    assert np.mean([ratio > 1.0 for ratio in given]) < 0.2
 
 
 def test_a_turned_body_has_turned_nodes(bare: Surrogate, small: Body) -> None:
