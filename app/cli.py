@@ -240,6 +240,12 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
 @click.option("--points", type=int, help="Most points of a cloud used; larger clouds are thinned.")
 @click.option("--rounds", type=int, help="How often a cold start gathers the forces where it has found some.")
 @click.option("--solver", type=click.Choice(["gauss-newton", "l-bfgs"]), help="How the objective is minimised.")
+@click.option(
+    "--penalty",
+    type=click.Choice(["prior", "amplitude", "divergence"]),
+    help="What forces cost: by their Gaussian prior, or by l-bfgs with their size or divergence in its place.",
+)
+@click.option("--alpha", type=float, help="Weight of such a penalty beside the distances, in [0, 1].")
 @click.option("--max-iterations", type=int, help="Most iterations; 0: what the solver is content with.")
 @click.option(
     "--unknown",

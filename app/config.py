@@ -234,6 +234,12 @@ class RegistrationSection(_Section):
         description="how often a cold start gathers the forces where it has found some; -1: as the model and zone ask",
     )
     solver: Literal["gauss-newton", "l-bfgs"] = Field("gauss-newton", description="how the objective is minimised")
+    penalty: Literal["prior", "amplitude", "divergence"] = Field(
+        "prior",
+        description="what forces cost: by their Gaussian prior, or by l-bfgs with their size (Odot 2023, eq. 6.5) or "
+        "squared divergence (6.6) over the surface in its place",
+    )
+    alpha: float = Field(0.1, ge=0.0, le=1.0, description="weight of such a penalty beside the distances")
     max_iterations: int = Field(
         0, ge=0, description="most iterations; 0: what the solver is content with (gauss-newton 40, l-bfgs 200 a run)"
     )

@@ -29,6 +29,7 @@ from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.marks import Marks
+from softtwin.registration.penalties import PENALTIES
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import (
     NOISE,
@@ -515,7 +516,11 @@ def _takes_marks(registrar: Engine) -> Registrar | HybridRegistrar:
 def _options(section: RegistrationSection, suited: RegistrationOptions) -> RegistrationOptions:
     spread = 0.0 if section.noise_known else NOISE.spread
     noise = Scale(section.noise, spread, least=min(NOISE.least, section.noise))
-    solver = LBFGS() if section.solver == "l-bfgs" else suited.solver
+    solver = suited.solver
+    if section.penalty != "prior":
+        solver = LBFGS(penalty=PENALTIES[section.penalty](section.alpha))
+    elif section.solver == "l-bfgs":
+        solver = LBFGS()
     if section.max_iterations:
         solver = replace(solver, max_iterations=section.max_iterations)
     gathering = suited.gathering

@@ -104,6 +104,10 @@ def case(name: str) -> Case:
         loads = LoadPlan(amplitude=AMPLITUDES["modal"], radius=(0.055, 0.64))
         samples = {"train": 1, "validation": 1000, "test": 10000, "calibration": 10000}
         return Case("certificates", beam, Plan("neo-hookean", 5000.0, 0.45, loads, samples, seed=9), 0, 64)
+    if name == "beam-6.1":  # for beam_registration.py
+        loads = LoadPlan(amplitude=AMPLITUDES["modal"], radius=(0.055, 0.64))
+        samples = {"train": 8192, "validation": 256, "test": 512}
+        return Case("6.1", beam, Plan("neo-hookean", 4500.0, 0.49, loads, samples, seed=6), 0, 64)
     if name == "ranges":  # the small beam under loads of all sizes, for certificates.py
         loads = LoadPlan(displacement=0.4, radius=(0.055, 0.64))
         samples = {"train": 4096, "validation": 256, "test": 10000, "calibration": 10000}

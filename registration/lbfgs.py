@@ -15,6 +15,7 @@ from . import marks
 from .gauss_newton import Found, LocalModel, Step
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
+from .penalties import Penalty
 from .problem import Problem, Trial
 
 Floats = NDArray[np.float64]
@@ -32,6 +33,8 @@ class LBFGS:
         max_iterations: of one run.
         memory: pairs that the Hessian is built from.
         tolerance: relative fall of the objective below which a run ends.
+        penalty: what forces cost in place of their Gaussian prior; None for that. What is said of doubt is by the
+            prior all the same.
         until: no state is looked for after this time of the monotonic clock, seconds.
     """
 
@@ -39,6 +42,7 @@ class LBFGS:
     max_iterations: int = 200
     memory: int = 30
     tolerance: float = 1e-9
+    penalty: Penalty | None = None
     until: float = np.inf
 
     def __post_init__(self) -> None:
@@ -98,6 +102,8 @@ class _Run:
         self.options, self.problem = options, problem
         self.trial = self.best = problem.trial(start, near, anew=True)
         self.evaluations, self.trace = 1, list[Step]()
+        penalty = options.penalty
+        self.cost = None if penalty is None else penalty.of(problem.observed.body, problem.forces)
 
     def found(self) -> Found:
         noise = max(robust_deviation(self.trial.match.distances), self.problem.noise.least)
@@ -128,10 +134,16 @@ class _Run:
                 met_wall = True
                 return _WALL * max(least, 1.0), np.zeros_like(scaled)
             value, gradient = _objective(problem, trial, loss, local)
-            value += 0.5 * float(scaled @ scaled)
+            held = scaled.copy()  # what the Gaussian priors pull back
+            if self.cost is not None:
+                part = problem.force_part
+                held[part] = 0.0
+                paid, slope = self.cost(trial.coefficients[part])
+                value, gradient[part] = value + paid, gradient[part] + slope
+            value += 0.5 * float(held @ held)
             if value < least:
                 least, self.best = value, trial
-            return value, root * gradient + scaled
+            return value, root * gradient + held
 
         limits = {"maxiter": self.options.max_iterations, "ftol": self.options.tolerance, "maxcor": self.options.memory}
         try:

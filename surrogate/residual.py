@@ -100,7 +100,7 @@ class ElasticBody(nn.Module):
     def energy(self, displacement: Tensor) -> Tensor:
         """Strain energy, (s,), joules; NaN where the law is none for a cell inside out."""
         F = self.deformation_gradients(displacement)
-        return (self._density(F) * self.volumes).sum(dim=(1, 2))
+        return (self.density(F) * self.volumes).sum(dim=(1, 2))
 
     def internal_forces(self, displacement: Tensor) -> Tensor:
         """Derivative of the strain energy, (s, n, 3), newtons; itself differentiable."""
@@ -108,7 +108,7 @@ class ElasticBody(nn.Module):
         is_differentiated = F.requires_grad
         with torch.enable_grad():
             at = F if is_differentiated else F.requires_grad_()
-            (stress,) = torch.autograd.grad(self._density(at).sum(), at, create_graph=is_differentiated)
+            (stress,) = torch.autograd.grad(self.density(at).sum(), at, create_graph=is_differentiated)
         shares = torch.einsum("scqij,cqkj,cq->scki", stress, self.gradients, self.volumes)
         forces = torch.zeros(len(F), self.nodes, 3, dtype=F.dtype, device=F.device)
         return forces.index_add(1, self.cells.reshape(-1), shares.reshape(len(F), -1, 3))
@@ -116,7 +116,7 @@ class ElasticBody(nn.Module):
     def cell_stiffnesses(self, displacement: Tensor) -> Tensor:
         """Tangents of the cells at one state, (n, 3), metres: (cells, 3k, 3k), N/m, node by node."""
         F = self.deformation_gradients(displacement[None])[0]
-        stress = torch.func.grad(lambda at: self._density(at).sum())
+        stress = torch.func.grad(lambda at: self.density(at).sum())
         ways = torch.eye(9, dtype=F.dtype, device=F.device).reshape(9, 3, 3)
         slopes = [torch.func.jvp(stress, (F,), (way.expand_as(F),))[1] for way in ways]
         moduli = torch.stack(slopes, dim=-1).unflatten(-1, (3, 3)) * self.volumes[..., None, None, None, None]
@@ -150,7 +150,8 @@ class ElasticBody(nn.Module):
         self._check("forces", forces)
         return self.energy(displacement) - (forces * displacement).sum(dim=(1, 2))
 
-    def _density(self, F: Tensor) -> Tensor:
+    def density(self, F: Tensor) -> Tensor:
+        """Strain energy of deformation gradients, (..., 3, 3), joules a cubic metre, (...)."""
         named = {name: getattr(self, f"parameter_{name}") for name in self.material.parameters}
         density: Tensor = self.material.energy(F, None, SimpleNamespace(**named), TorchAlgebra(F, self.least_jacobian))
         return density

@@ -313,6 +313,8 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
         "pose_turn": 3.0,
         "pose_shift": 0.02,
         "landmark_deviation": 1e-3,
+        "penalty": "amplitude",
+        "alpha": 0.2,
     }
     flags = [word for name, value in wanted.items() for word in (f"--{name.replace('_', '-')}", value)]
     register(capsys, mesh_folder, mesh_cloud, *flags, "--noise-known", "--format", "ply", "--format", "stl")

@@ -1,0 +1,344 @@
+"""Registration of the thesis's beam with a network (table 6.1, figure 6.9): bending, torsion and both, unseen cases.
+
+    python benchmarks/beam_registration.py [--cases 10000] [--seconds 200] [--ranks 2]
+
+1 x 0.25 x 0.25 m, 304 hexahedra, Neo-Hookean, 4500 Pa, 0.49. The network learns from 8,192 modal loads; cases are
+fresh loads of that kind on a patch, made of the bending modes alone, of the torsional ones alone, and of both, solved
+by the reference. Clouds are 1,000 points of the whole deformed surface without noise. One row knows which nodes may
+carry force, one does not, and one minimises as the thesis does: first order (L-BFGS), gradient by the adjoint, on nodes
+that may carry force, ended by its rule, a gradient of 1e-4 of the first.
+
+The beam may be pushed into one place in several ways: cases whose surface is matched in another state are counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from inverse import cloud_of
+from networks import RUNS
+from networks_bodies import case, data_of
+from numpy.typing import NDArray
+from record import recorded, write
+from scipy.optimize import minimize
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from softtwin.meshes.body import Body
+from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.data.samplers import draw_load
+from softtwin.reference.solve.problem import Problem
+from softtwin.registration.evidence import Scale
+from softtwin.registration.forward import ForwardModel
+from softtwin.registration.registrar import expected_force, options_for, prepare
+from softtwin.registration.residuals import SurfaceDistance
+from softtwin.surrogate.discrepancy import with_discrepancy
+from softtwin.surrogate.domain import with_domain
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.residual import ElasticBody
+from softtwin.surrogate.train import train
+from softtwin.surrogate.twin import load as load_twin
+from softtwin.surrogate.twin import save
+
+Floats = NDArray[np.float64]
+NAME, BODY = "beam_registration", "beam-6.1"
+MODULUS, RATIO, POINTS = 4500.0, 0.49, 1000
+CLEAR = Scale(1e-4, 1.0, least=1e-5)  # metres: points without noise
+KINDS = ("bending", "torsion", "both")
+FRESH = 1_000_000
+MATCHED, WRONG = (
+    1e-4,
+    1e-3,
+)  # metres: root mean square distance of a surface that is matched, mean error of a wrong state
+STRESSED = 300  # cases whose stresses are compared
+_SWEEPS, _RELATIVE = 400, 1e-4  # of the thesis's rule
+
+
+def kinds_of_modes(body: Body, shapes: Floats) -> dict[str, NDArray[np.int64]]:
+    """Modes that bend the beam, that twist it, and both; by how the tip moves: as a whole aside, or about the axis."""
+    tip = body.node_sets["tip"]
+    arm = body.points[tip][:, 1:] - body.points[tip][:, 1:].mean(axis=0)
+    across = shapes[:, tip, 1:]
+    aside = np.linalg.norm(across.mean(axis=1), axis=1)
+    turn = np.abs((arm[:, 0] * across[:, :, 1] - arm[:, 1] * across[:, :, 0]).mean(axis=1)) / np.abs(arm).max()
+    along = np.abs(shapes[:, tip, 0].mean(axis=1))
+    bends = np.flatnonzero((aside > turn) & (aside > along))
+    twists = np.flatnonzero((turn > aside) & (turn > along))
+    return {"bending": bends, "torsion": twists, "both": np.sort(np.concatenate([bends, twists]))}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One load with its equilibrium.
+
+    Args:
+        number: of the draw.
+        kind: of its modes.
+        forces: (n, 3), newtons.
+        truth: displacement, (n, 3), metres.
+        cloud: points of the deformed surface, (p, 3), metres.
+    """
+
+    number: int
+    kind: str
+    forces: Floats
+    truth: Floats
+    cloud: Floats
+
+
+def cases(data: DataSet, problem: Problem, count: int) -> Iterator[Case]:
+    """Fresh cases, a third of each kind; a load without a stable equilibrium is drawn again."""
+    plan, modes = case(BODY).plan, kinds_of_modes(data.body, data.shapes[: case(BODY).plan.loads.modes])
+    made, number = 0, FRESH
+    while made < count:
+        kind = KINDS[made % len(KINDS)]
+        rng = np.random.default_rng([plan.seed, 7, number])
+        own = replace(plan.loads, modes=len(modes[kind]))
+        assert own.amplitude is not None
+        forces = own.amplitude * draw_load(data.body, data.shapes[modes[kind]], own, rng)
+        number += 1
+        try:
+            state = problem.solve(forces)
+        except NotConverged:
+            continue
+        if state.negative_pivots == 0:
+            made += 1
+            cloud = cloud_of(data.body, state.displacement, rng, POINTS)
+            yield Case(number - 1, kind, forces, state.displacement, cloud)
+
+
+def network_of(data: DataSet, seconds: float) -> Surrogate:
+    """The reduced network, trained once."""
+    folder = RUNS / f"{BODY}-{seconds:g}s"
+    if not (folder / "surrogate.json").exists():
+        learned = train(data, TrainingPlan(Reduced(modes=64), seconds=seconds))
+        save(with_discrepancy(with_domain(learned, data), data), folder)
+    return load_twin(folder, data.body)
+
+
+class Clock:
+    """Seconds that registrations spend in states, closest points and derivatives."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = defaultdict(float)
+
+    def timed(self, name: str, run: Callable[..., Any]) -> Callable[..., Any]:
+        """The same, its time taken."""
+
+        def wrapped(*given: Any, **named: Any) -> Any:
+            begun = time.perf_counter()
+            try:
+                return run(*given, **named)
+            finally:
+                self.spent[name] += time.perf_counter() - begun
+
+        return wrapped
+
+
+@contextmanager
+def watched(clock: Clock) -> Iterator[None]:
+    """Take the times of all problems of registration meanwhile."""
+    from softtwin.registration.problem import Problem as Search
+
+    kept = {name: getattr(Search, name) for name in ("_state", "jacobian")}
+    matches = {name: getattr(SurfaceDistance, name) for name in ("match", "match_nearby", "match_beyond")}
+    try:
+        Search._state = clock.timed("states", kept["_state"])
+        Search.jacobian = clock.timed("derivatives", kept["jacobian"])
+        for name, run in matches.items():
+            setattr(SurfaceDistance, name, clock.timed("closest points", run))
+        yield
+    finally:
+        for name, run in kept.items():
+            setattr(Search, name, run)
+        for name, run in matches.items():
+            setattr(SurfaceDistance, name, run)
+
+
+def stresses(elastic: ElasticBody, displacement: Floats) -> Floats:
+    """Von Mises stress of each cell, (c,), pascals: of the mean Cauchy stress of its points."""
+    gradients = elastic.deformation_gradients(torch.from_numpy(displacement)[None])[0].requires_grad_()
+    density = elastic.density(gradients)
+    (first,) = torch.autograd.grad(density.sum(), gradients)
+    cauchy = first @ gradients.transpose(-1, -2) / torch.linalg.det(gradients)[..., None, None]
+    mean = cauchy.detach().mean(dim=1).numpy()
+    deviatoric = mean - np.trace(mean, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+    return np.sqrt(1.5 * (deviatoric**2).sum(axis=(1, 2)))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a way of registering made of a case.
+
+    Args:
+        displacement: (n, 3), metres.
+        forces: (n, 3), newtons.
+        rms: distance of the cloud to the surface, metres.
+        iterations: of it.
+        verdict: in words; empty for a way that gives none.
+    """
+
+    displacement: Floats
+    forces: Floats
+    rms: float
+    iterations: int
+    verdict: str = ""
+
+
+Way = Callable[[Case], Answer]
+
+
+def ours(network: ForwardModel, is_known: bool) -> Way:
+    """The product's registrar, from rest."""
+    outer = np.setdiff1d(network.body.boundary_nodes, network.body.fixed)
+    scale = expected_force(network.body, MODULUS)
+    options = replace(options_for(network, is_known), noise=CLEAR)
+    everywhere = None if is_known else prepare(network, outer, force_scale=scale, options=options)
+
+    def run(given: Case) -> Answer:
+        registrar = everywhere
+        if registrar is None:
+            own = np.flatnonzero(np.abs(given.forces).max(axis=1) > 0.0)
+            registrar = prepare(network, own, force_scale=scale, options=options)
+        found = registrar.register(given.cloud)
+        return Answer(
+            found.displacement, found.forces, found.rms_distance, len(found.trace), found.judgement.verdict.value
+        )
+
+    return run
+
+
+def first_order(network: Surrogate) -> Way:
+    """As the thesis minimises: mean square distance, gradient by the network's adjoint, no prior, L-BFGS."""
+    observed, body = SurfaceDistance(network.body), network.body
+
+    def run(given: Case) -> Answer:
+        own = np.flatnonzero(np.abs(given.forces).max(axis=1) > 0.0)
+        count, first, kept = [0], [0.0], [np.zeros(3 * len(own))]
+
+        def value(coefficients: Floats) -> tuple[float, Floats]:
+            forces = np.zeros_like(body.points)
+            forces[own] = coefficients.reshape(-1, 3)
+            state = network.solve(forces)
+            positions = state.displacement[observed.nodes]
+            match = observed.match(positions, given.cloud)
+            full = np.zeros_like(body.points)
+            full[observed.nodes] = (observed.rows(match).T @ match.distances).reshape(-1, 3) / len(given.cloud)
+            gradient = state.pull(full)[own].ravel()
+            first[0] = first[0] or float(np.linalg.norm(gradient))
+            if np.linalg.norm(gradient) <= _RELATIVE * first[0]:
+                kept[0] = coefficients.copy()
+                raise StopIteration
+            return 0.5e8 * float(
+                np.mean(match.distances**2)
+            ), 1e8 * gradient  # SciPy's line search dislikes tiny numbers
+
+        def step(coefficients: Floats) -> None:
+            count[0] += 1
+            kept[0] = coefficients.copy()
+
+        try:
+            options = {"maxiter": _SWEEPS, "gtol": 0.0, "ftol": 0.0, "maxcor": 30}
+            minimize(value, kept[0], jac=True, method="L-BFGS-B", callback=step, options=options)
+        except StopIteration:
+            count[0] += 1
+        forces = np.zeros_like(body.points)
+        forces[own] = kept[0].reshape(-1, 3)
+        found = network.solve(forces).displacement
+        return Answer(found, forces, observed.match(found[observed.nodes], given.cloud).rms, count[0])
+
+    return run
+
+
+def figures_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means, deviations, extremes over all cases; failures are counted and in no average."""
+    done = [row for row in rows if row["failure"] is None]
+    found: dict[str, Any] = {"cases": len(rows), "failed": [row["number"] for row in rows if row["failure"]]}
+    for name in ("mean_m", "largest_m", "norm_over_nodes_m", "rms_m", "force_off", "iterations", "ms"):
+        values = np.array([row[name] for row in done], dtype=np.float64)
+        found[name] = {"mean": values.mean(), "deviation": values.std(), "least": values.min(), "most": values.max()}
+        found[name] |= {"median": np.median(values), "p95": np.quantile(values, 0.95)}
+    matched = [row["rms_m"] <= MATCHED for row in done]
+    wrong = [row["mean_m"] > WRONG for row in done]
+    found["matched"] = float(np.mean(matched))
+    found["matched_in_a_wrong_state"] = float(np.mean(np.logical_and(matched, wrong)))
+    verdicts = [row["verdict"] for row in done]
+    found["verdicts"] = {name: verdicts.count(name) for name in sorted(set(verdicts)) if name}
+    accepted = [row["mean_m"] for row in done if row["verdict"] == "accepted"]
+    found["accepted_largest_mean_m"] = max(accepted, default=None)
+    stress = [row["stress_off"] for row in done if row["stress_off"] is not None]
+    found["stress_off"] = float(np.mean(stress)) if stress else None
+    return found
+
+
+def judged(way: Way, given: Case, elastic: ElasticBody | None) -> dict[str, Any]:
+    """One case by one way."""
+    row: dict[str, Any] = {"number": given.number, "kind": given.kind, "failure": None}
+    begun = time.perf_counter()
+    try:
+        found = way(given)
+    except (NotConverged, ValueError) as error:
+        return {**row, "failure": str(error)}
+    row["ms"] = 1e3 * (time.perf_counter() - begun)
+    away = np.linalg.norm(found.displacement - given.truth, axis=1)
+    row |= {"mean_m": away.mean(), "largest_m": away.max(), "norm_over_nodes_m": np.linalg.norm(away) / len(away)}
+    row |= {"rms_m": found.rms, "iterations": found.iterations, "verdict": found.verdict}
+    row["force_off"] = np.linalg.norm((found.forces - given.forces).sum(axis=0)) / np.linalg.norm(
+        given.forces.sum(axis=0)
+    )
+    row["stress_off"] = None
+    if elastic is not None:
+        true = stresses(elastic, given.truth)
+        row["stress_off"] = np.abs(stresses(elastic, found.displacement) - true).mean() / true.mean()
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=10_000, help="of all three kinds together")
+    parser.add_argument("--first-order", type=int, default=1000, help="cases of the thesis's way, which is slower")
+    parser.add_argument("--seconds", type=float, default=200.0, help="of training")
+    parser.add_argument("--ranks", type=int, default=2)
+    parser.add_argument("--name", default=NAME, help="of the record")
+    arguments = parser.parse_args()
+    found, data = recorded(arguments.name), data_of(BODY, arguments.ranks, jacobians=True)
+    network = network_of(data, arguments.seconds)
+    elastic = ElasticBody(data.body, NeoHookean(MODULUS, RATIO)).double()
+    ways: dict[str, tuple[Way, int]] = {
+        "where forces act is known": (ours(network, True), arguments.cases),
+        "forces anywhere": (ours(network, False), arguments.cases),
+        "L-BFGS, gradient 1e-4, no prior": (first_order(network), arguments.first_order),
+    }
+    wanted = {name: pair for name, pair in ways.items() if name not in found}
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in wanted}
+    clocks = {name: Clock() for name in wanted}
+    with threadpool_limits(1), Problem(data.body, NeoHookean(MODULUS, RATIO)) as problem:
+        for place, given in enumerate(tqdm(cases(data, problem, arguments.cases), total=arguments.cases, desc="cases")):
+            for name, (way, count) in wanted.items():
+                if place < count:
+                    with watched(clocks[name]):
+                        rows[name].append(judged(way, given, elastic if place < STRESSED else None))
+    for name, each in rows.items():
+        found[name] = {
+            **figures_of(each),
+            "kinds": {kind: figures_of([row for row in each if row["kind"] == kind]) for kind in KINDS},
+            "seconds_in": dict(clocks[name].spent),
+        }
+        write(arguments.name, found)
+        print(name, found[name], flush=True)
+
+
+if __name__ == "__main__":
+    main()
