@@ -98,35 +98,47 @@ def together(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
     }
 
 
-def minimised(elastic: ElasticBody, forces: Floats, start: Floats, free: NDArray[np.bool_]) -> Floats:
+def minimised(elastic: ElasticBody, forces: Floats, start: Floats, free: NDArray[np.bool_]) -> Floats | None:
     """The state of least potential near a start, by torch's energy, forces and stiffness alone (Newton, SuperLU).
 
-    A stiffness serves as long as steps shrink to a fifth.
+    A stiffness serves as long as steps shrink to a fifth; where one is indefinite and its step leads uphill, that at
+    rest takes its place. None where nothing is left that lowers the potential short of balance.
     """
     u, b = torch.from_numpy(start.copy())[None], torch.from_numpy(forces)[None]
     value, factor, last = float(elastic.potential(u, b)), None, np.inf
-    for _ in range(200):
+
+    def factored(displacement: torch.Tensor) -> Any:
+        return splu(elastic.stiffness(displacement).tocsc()[free][:, free].tocsc())
+
+    def downhill(solver: Any) -> tuple[torch.Tensor, float, float] | None:
         gap = (elastic.internal_forces(u) - b)[0].detach().numpy().ravel()
-        factor = factor or splu(elastic.stiffness(u[0]).tocsc()[free][:, free].tocsc())
         step = np.zeros_like(start).ravel()
-        step[free] = -factor.solve(gap[free])
-        length, way = 1.0, torch.from_numpy(step.reshape(1, -1, 3))
+        step[free] = -solver.solve(gap[free])
+        length, way, largest = 1.0, torch.from_numpy(step.reshape(1, -1, 3)), float(np.abs(step).max())
         while length > 1e-6:
             tried = float(elastic.potential(u + length * way, b))
-            if tried <= value + 1e-12 * abs(value):  # NaN where a cell is inside out
-                break
+            if tried <= value + 1e-12 * abs(value) or largest < 1e-9:  # NaN where a cell is inside out
+                return length * way, tried, largest
             length *= 0.5
-        u, value = u + length * way, tried
-        largest = float(np.abs(step).max())
+        return None
+
+    for _ in range(500):
+        factor = factor or factored(u[0])
+        found = downhill(factor) or downhill(factored(torch.zeros_like(u[0])))
+        if found is None:
+            return None
+        way, value, largest = found
+        u = u + way
         if largest < 1e-13:
-            break
+            return u[0].numpy()
         factor, last = (None if largest > 0.2 * last else factor), largest
-    return u[0].numpy()
+    return None
 
 
 def exactness(body: Body, count: int) -> dict[str, Any]:
     """Table of figure 7.21: the layer against an independent minimiser that starts from nine tenths of its state."""
-    elastic, rows, failed, sizes = ElasticBody(body, NeoHookean(MODULUS, RATIO)).double(), [], [], []
+    elastic, rows, sizes = ElasticBody(body, NeoHookean(MODULUS, RATIO)).double(), [], []
+    failed, undecided, apart = list[int](), list[int](), list[dict[str, float]]()
     free = np.ones(body.points.shape, dtype=bool)
     free[body.fixed] = False
     spent = {"layer": 0.0, "minimiser": 0.0}
@@ -141,18 +153,37 @@ def exactness(body: Body, count: int) -> dict[str, Any]:
                 continue
             spent["layer"] += time.perf_counter() - begun
             begun = time.perf_counter()
-            rows.append(distances(found, minimised(elastic, forces, 0.9 * found, free.ravel())))
+            least = minimised(elastic, forces, 0.9 * found, free.ravel())
             spent["minimiser"] += time.perf_counter() - begun
+            if least is None:
+                undecided.append(number)
+                continue
+            rows.append(distances(found, least))
+            if rows[-1]["largest"] > 1e-9:
+                apart.append(
+                    {"number": number, "largest_m": rows[-1]["largest"], **compared(problem, forces, found, least)}
+                )
             sizes.append(float(np.linalg.norm(found)))
     within = float(np.mean([row["largest"] <= 1e-9 for row in rows]))
     return {
         "loads": count,
         "failed": failed,
+        "minimiser_failed": undecided,
+        "apart": apart,
         "norm_of_displacement_m": {"mean": float(np.mean(sizes)), "deviation": float(np.std(sizes))},
         "distance": together(rows),
         "share_within_1e-9": within,
         "seconds_a_load": {name: value / len(rows) for name, value in spent.items()},
     }
+
+
+def compared(problem: Problem, forces: Floats, layer: Floats, least: Floats) -> dict[str, float]:
+    """Energy under the load, joules, and negative pivots of two states."""
+    found: dict[str, float] = {}
+    for name, state in (("layer", layer), ("minimiser", least)):
+        found[f"{name}_energy"] = problem.energy(state) - float((forces * state).sum())
+        found[f"{name}_negative_pivots"] = problem.negative_pivots(state) or 0
+    return found
 
 
 def cloud_of(body: Body, displacement: Floats, rng: np.random.Generator, count: int = POINTS) -> Floats:
