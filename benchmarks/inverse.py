@@ -54,6 +54,7 @@ TIGHT = NewtonOptions(tolerance=1e-12)
 EXACT = Scale(1e-9, 0.0, least=1e-9)  # metres: clouds without noise
 SOLVER = GaussNewton((Square(),), max_iterations=100, settled=1e-3, least_step=1e-14, graduation=0.0)
 POINTS, _LEFT = 2000, 5e-5  # metres that a search may leave of a cloud without noise
+SMOOTH = 0.1  # metres: neighbouring forces are alike where a search begins again at rest; afterwards each is its own
 
 
 def loads(body: Body, count: int) -> Iterator[tuple[int, Floats]]:
@@ -221,8 +222,12 @@ def force(body: Body, count: int) -> dict[str, Any]:
                 ended = GaussNewton().solve(search, begun)
                 solved = ended.evaluations
                 if ended.trial.match.rms > _LEFT:  # as `Registrar.follow` does where a start leads astray
-                    again = GaussNewton().solve(search, np.zeros(unknown.size))
-                    solved += again.evaluations
+                    smooth = nodal_forces(body, support, unknown.scale, SMOOTH)
+                    first = replace(search, model=reduce_model(model, observed.nodes, smooth.basis), forces=smooth)
+                    rough = GaussNewton().solve(first, np.zeros(smooth.size))
+                    begun = smooth.forces(rough.trial.coefficients)[unknown.nodes].ravel()
+                    again = GaussNewton().solve(search, begun)
+                    solved += rough.evaluations + again.evaluations
                     from_rest.append(number)
                     ended = min(ended, again, key=lambda found: found.trial.match.rms)
                 for noise in (1e-5, 1e-6, 1e-7):  # a cloud without noise, believed more and more
