@@ -1,0 +1,106 @@
+"""What forces cost: the Gaussian prior beside the thesis's penalties (eq. 6.5, 6.6), errors of displacement and force.
+
+    softtwin quickstart --output FOLDER
+    python benchmarks/penalties.py FOLDER [--loads 60]
+
+States of the quickstart's organ under loads of its kind that no data set holds, solved by the reference; clouds of
+1,000 points from the quickstart's camera with 0.5 mm of noise, no zone told, from rest, surrogate. `prior` is the
+product's own solver and, by L-BFGS, its objective without either penalty. Frames that are refused are counted and are
+in the errors all the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from margins import FRESH
+from numpy.typing import NDArray
+from record import recorded, write
+from threadpoolctl import threadpool_limits
+
+from softtwin.app.quickstart import CAMERA, POINTS
+from softtwin.app.twin import Twin
+from softtwin.meshes.clouds import CloudError, partial_view
+from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.generate import plan_from_header, ramp_loads
+from softtwin.reference.solve.problem import Problem
+
+Floats = NDArray[np.float64]
+NAME, NOISE = "penalties", 5e-4
+ROWS: dict[str, dict[str, Any]] = {
+    "prior": {},
+    "prior, L-BFGS": {"solver": "l-bfgs"},
+    **{
+        f"{penalty}, alpha {alpha:g}": {"penalty": penalty, "alpha": alpha}
+        for penalty in ("amplitude", "divergence")
+        for alpha in (0.0001, 0.01, 0.1, 1.0)
+    },
+}
+
+
+def truths(data: DataSet, count: int) -> list[tuple[Floats, Floats]]:
+    """Fresh loads, newtons, with their stable states, metres, (n, 3) each."""
+    plan, found = plan_from_header(data.header), list[tuple[Floats, Floats]]()
+    with Problem(data.body, plan.build_material()) as problem:
+        for number in range(FRESH, FRESH + 2 * count):
+            load, factors = ramp_loads(data, plan, number)
+            try:
+                state = problem.solve(factors[-1] * load)
+            except NotConverged:
+                continue
+            if state.is_stable and len(found) < count:
+                found.append((factors[-1] * load, state.displacement))
+    return found
+
+
+def one(twin: Twin, load: Floats, truth: Floats, seed: int) -> dict[str, Any]:
+    """Errors of one registration."""
+    rng = np.random.default_rng(seed)
+    cloud = partial_view(twin.body, truth, CAMERA, POINTS, NOISE, rng, surface="observed")
+    begun = time.perf_counter()
+    try:
+        result = twin.register(cloud, "")
+    except (CloudError, NotConverged):
+        return {"verdict": "none"}
+    seconds = time.perf_counter() - begun
+    off = np.linalg.norm(result.forces - load, axis=1).sum() / np.linalg.norm(load, axis=1).sum()
+    net = np.linalg.norm(result.net_force - load.sum(axis=0)) / np.linalg.norm(load, axis=1).sum()
+    error = 1e3 * float(np.linalg.norm(result.displacement - truth, axis=1).mean())
+    return {"verdict": result.judgement.verdict.value, "error_mm": error, "forces_off": float(off),
+            "net_off": float(net), "seconds": seconds}  # fmt: skip
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Over all frames with a result."""
+    used, verdicts = [row for row in rows if row["verdict"] != "none"], [row["verdict"] for row in rows]
+    counts = {name: verdicts.count(name) for name in sorted(set(verdicts))}
+    found: dict[str, Any] = {"loads": len(rows), "verdicts": counts}
+    for name in ("error_mm", "forces_off", "net_off", "seconds"):
+        values = np.array([row[name] for row in used])
+        found[name] = {"mean": values.mean(), "median": np.median(values), "p95": np.quantile(values, 0.95)}
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--loads", type=int, default=60)
+    parser.add_argument("--name", default=NAME, help="of the record")
+    arguments = parser.parse_args()
+    found = recorded(arguments.name)
+    given = truths(DataSet(arguments.folder / "data.zarr"), arguments.loads)
+    for label, options in ROWS.items():
+        if label not in found:
+            with threadpool_limits(1), Twin.open(arguments.folder, "surrogate", **options) as twin:
+                found[label] = summary([one(twin, *pair, seed) for seed, pair in enumerate(given)])
+            write(arguments.name, found)
+        print(label, found[label], flush=True)
+
+
+if __name__ == "__main__":
+    main()
