@@ -157,6 +157,13 @@ def make_registration(folder: Path, body: Body, frames: int = 4) -> None:
     """Frames as `softtwin register` writes them: all good but the second, which is refused, and a cloud without use."""
     twin = Twin(Still(body), Config.model_validate({"body": {"unit": "mm"}}))  # type: ignore[arg-type]
     shapes = bends(body, frames)
+    bounds = iter([(2e-4, ()), (3e-4, ()), (4e-4, ("it lies 3 times as far out",)), (5e-4, ())])
+
+    def bounded(found: Registration) -> SimpleNamespace:
+        mean, reasons = next(bounds)
+        return SimpleNamespace(mean=mean, largest=9e-4, confidence=0.9, is_inside=not reasons, reasons=reasons)
+
+    twin.bounded = bounded  # type: ignore[method-assign, assignment]
     with Recorder(Exporter(twin, folder)) as recorder:
         for number, shape in enumerate(shapes):
             refused = number == 1
@@ -290,6 +297,15 @@ def test_the_users_own_registrations_are_shown(page: Page) -> None:
     assert "Young's modulus 4000 Pa (3900 to 12345), not told by the cloud" in text
     assert [words.split(" frame")[0] for words in page.pictures() if " frame (" in words] == ["first", "worst", "last"]
     assert "surrogate: the surrogate gave up." in text and "most iterations" in text
+
+
+def test_the_networks_bounds_are_shown_beside_the_frames(page: Page, full: Workspace) -> None:
+    text = " ".join(page.text.split())
+    assert "network off, mean (mm)" in text and "no bound" in text
+    assert "a bound that 90 % of the loads like those of its calibration keep" in text
+    rows = json.loads((full.folder / "registrations" / "morning" / "registration.json").read_text())["frames"]
+    assert [row["network"]["is_inside"] for row in rows[:4]] == [True, True, False, True]
+    assert rows[2]["network"]["reasons"] == ["it lies 3 times as far out"]
 
 
 def test_registrations_elsewhere_are_named(full: Workspace, tmp_path: Path, body: Body, no_rendering: None) -> None:
