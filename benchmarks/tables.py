@@ -274,6 +274,57 @@ def checked_network() -> None:
                 )
 
 
+def beam_registration() -> None:
+    """Table 6.1: the thesis's beam registered with a network."""
+    found = recorded("beam_registration")
+    if not found:
+        return
+    head(
+        "beam_registration",
+        "cases; failed",
+        "mean nodal mm",
+        "largest mm",
+        "net force off %, median",
+        "stress off %",
+        "iterations",
+        "ms",
+        "matched; in a wrong state %",
+        "verdicts",
+    )
+    for way, whole in found.items():
+        for kind, f in {"": whole, **whole["kinds"]}.items():
+            row(
+                f"{way}{', ' if kind else ''}{kind}",
+                f"{f['cases']}; {len(f['failed'])}",
+                f"{1e3 * f['mean_m']['mean']:.3f} +- {1e3 * f['mean_m']['deviation']:.3f}",
+                f"{1e3 * f['largest_m']['mean']:.2f} ({1e3 * f['largest_m']['most']:.1f})",
+                f"{100 * f['force_off']['median']:.1f}",
+                "-" if f["stress_off"] is None else f"{100 * f['stress_off']:.1f}",
+                f"{f['iterations']['mean']:.0f} +- {f['iterations']['deviation']:.0f}",
+                f"{f['ms']['mean']:.0f} +- {f['ms']['deviation']:.0f}",
+                f"{100 * f['matched']:.1f}; {100 * f['matched_in_a_wrong_state']:.1f}",
+                ", ".join(f"{count} {verdict}" for verdict, count in f["verdicts"].items()) or "-",
+            )
+
+
+def penalties() -> None:
+    """What forces cost: errors under each penalty."""
+    found = recorded("penalties")
+    if not found:
+        return
+    forces = ("nodal forces off, median", "net force off, median")
+    head("penalties", "accepted; doubtful; refused", "mean nodal mm (95 %)", *forces, "median s")
+    for label, f in found.items():
+        row(
+            label,
+            "; ".join(str(f["verdicts"].get(name, 0)) for name in ("accepted", "doubtful", "refused")),
+            f"{f['error_mm']['mean']:.2f} ({f['error_mm']['p95']:.2f})",
+            f"{f['forces_off']['median']:.2f}",
+            f"{f['net_off']['median']:.2f}",
+            f"{f['seconds']['median']:.2f}",
+        )
+
+
 def margins() -> None:
     """How often margins cover the truth, and how well the predicted error tells the true one."""
     found = recorded("margins")
@@ -419,6 +470,8 @@ def print_all() -> None:
     hybrid()
     certificates()
     checked_network()
+    beam_registration()
+    penalties()
     margins()
     active_rounds()
     throughput()
