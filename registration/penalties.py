@@ -16,7 +16,7 @@ from .unknowns import Forces
 
 Floats = NDArray[np.float64]
 Cost = Callable[[Floats], tuple[float, Floats]]
-_ROUND = 1e-3  # of the expected force: where the root of a square is rounded off, so that it has a derivative
+_ROUND = 0.02  # of the expected force: where the root of a square is rounded off, so that it has a derivative
 
 
 class Penalty(Protocol):

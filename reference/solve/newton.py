@@ -50,7 +50,7 @@ class NewtonOptions:
         elimination: where the energy's search cuts a step by more than half on the way from rest, balance the cells
             most out of balance alone before the next (three times at most, then load steps; on one rank; never from
             a guess, whose neighbour is wanted).
-        chord: keep a factorisation while it converges fast, its steps improved by what they showed (BFGS); False factors
+        chord: keep a factorisation while it converges fast, its steps improved by what they show (BFGS); False factors
             in each iteration.
         linear: `band` (LAPACK, for slender bodies; MUMPS for others), `mumps`, `multigrid` (conjugate gradients with
             smoothed aggregation), or `auto` by size and shape.

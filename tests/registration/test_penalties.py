@@ -40,8 +40,9 @@ def test_gradients_are_exact(body: Body, rng, penalty: Penalty, smoothness: floa
 def test_the_amplitude_is_the_sum_of_the_forces(body: Body, rng) -> None:
     forces = everywhere(body)
     at = 0.05 * rng.standard_normal(forces.size)
-    expected = 0.5 * 0.4 * np.linalg.norm(forces.forces(at), axis=1).sum() / SCALE.median
-    assert Amplitude(0.4).of(body, forces)(at)[0] == pytest.approx(expected, rel=2e-3)
+    whole = 0.5 * 0.4 * np.linalg.norm(forces.forces(at), axis=1).sum() / SCALE.median
+    rounded = 0.5 * 0.4 * 0.02 * len(forces.nodes)  # what is taken off where the root has its corner
+    assert whole - rounded < Amplitude(0.4).of(body, forces)(at)[0] < whole
 
 
 def test_the_divergence_is_that_of_a_linear_traction() -> None:
