@@ -126,7 +126,7 @@ def test_states_keep_what_they_are(
     first = model.solve(forces)
     before = (first.displacement.copy(), first.push(changes), first.pull(cotangent))
     forces[:] = 0.0
-    second = model.solve(other, near=first)
+    second = model.solve(2.0 * other, near=first)  # so far that its derivatives differ, whichever load was drawn
     apart = (second.displacement.copy(), second.push(changes), second.pull(cotangent))
     again = (first.displacement, first.push(changes), first.pull(cotangent))
     for was, now, elsewhere in zip(before, again, apart, strict=True):
