@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+_SHOWN = warnings.showwarning
 with contextlib.suppress(ImportError):
     import dolfinx_solver  # noqa: F401  the PyPI wheel wants to be imported before dolfinx
 import petsc4py
@@ -36,6 +37,9 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from softtwin.meshes.elements import Kind
+
+if warnings.showwarning is not _SHOWN:  # FFCx 0.5 turns all of Python's warnings into lines of its log
+    logging.captureWarnings(False)
 
 __all__ = [
     "MPI",

@@ -527,3 +527,13 @@ def test_a_limit_point_is_said_to_be_one() -> None:
             assert error.last is not None and error.last.is_stable
         else:
             assert state.displacement[19, 1] < -0.06  # it found its way to the other side
+
+
+def test_pythons_warnings_stay_what_they_are() -> None:
+    """FFCx would turn them into lines of its log, past the command line's own way and past `pytest.warns`."""
+    program = (
+        "import warnings; before = warnings.showwarning; import softtwin.reference.fem.fenicsx; "
+        "assert warnings.showwarning is before"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
