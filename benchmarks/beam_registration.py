@@ -40,6 +40,7 @@ from softtwin.reference.data.samplers import draw_load
 from softtwin.reference.solve.problem import Problem
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel
+from softtwin.registration.problem import Problem as Search
 from softtwin.registration.registrar import expected_force, options_for, prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.surrogate.discrepancy import with_discrepancy
@@ -150,8 +151,6 @@ class Clock:
 @contextmanager
 def watched(clock: Clock) -> Iterator[None]:
     """Take the times of all problems of registration meanwhile."""
-    from softtwin.registration.problem import Problem as Search
-
     kept = {name: getattr(Search, name) for name in ("_state", "jacobian")}
     matches = {name: getattr(SurfaceDistance, name) for name in ("match", "match_nearby", "match_beyond")}
     try:

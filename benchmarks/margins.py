@@ -42,11 +42,11 @@ ROWS: dict[str, tuple[float, float | None]] = {
 }
 
 
-def truths(data: DataSet, count: int, poisson_ratio: float | None) -> list[Floats]:
-    """States under fresh loads, those that have one."""
+def truths(data: DataSet, count: int, poisson_ratio: float | None = None) -> list[tuple[Floats, Floats]]:
+    """Fresh loads, newtons, that have a stable state, and this, metres, (n, 3) each."""
     plan = plan_from_header(data.header)
     material = NeoHookean(plan.young_modulus, poisson_ratio or plan.poisson_ratio)
-    found: list[Floats] = []
+    found: list[tuple[Floats, Floats]] = []
     with Problem(data.body, material) as problem:
         for number in range(FRESH, FRESH + 2 * count):
             load, factors = ramp_loads(data, plan, number)
@@ -55,7 +55,7 @@ def truths(data: DataSet, count: int, poisson_ratio: float | None) -> list[Float
             except NotConverged:
                 continue
             if state.is_stable and len(found) < count:
-                found.append(state.displacement)
+                found.append((factors[-1] * load, state.displacement))
     return found
 
 
@@ -122,7 +122,7 @@ def main() -> None:
     found = recorded(arguments.name)
     data = DataSet(arguments.folder / "data.zarr")
     for label, (noise, poisson_ratio) in ROWS.items():
-        states = truths(data, arguments.loads, poisson_ratio)
+        states = [state for _, state in truths(data, arguments.loads, poisson_ratio)]
         for engine in arguments.engines:
             key = f"{engine}, {label}"
             if key not in found:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from margins import FRESH
+from margins import truths
 from numpy.typing import NDArray
 from record import recorded, write
 from threadpoolctl import threadpool_limits
@@ -27,8 +27,6 @@ from softtwin.app.twin import Twin
 from softtwin.meshes.clouds import CloudError, partial_view
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.outcome import NotConverged
-from softtwin.reference.generate import plan_from_header, ramp_loads
-from softtwin.reference.solve.problem import Problem
 
 Floats = NDArray[np.float64]
 NAME, NOISE = "penalties", 5e-4
@@ -41,21 +39,6 @@ ROWS: dict[str, dict[str, Any]] = {
         for alpha in (0.01, 0.1, 1.0)
     },
 }
-
-
-def truths(data: DataSet, count: int) -> list[tuple[Floats, Floats]]:
-    """Fresh loads, newtons, with their stable states, metres, (n, 3) each."""
-    plan, found = plan_from_header(data.header), list[tuple[Floats, Floats]]()
-    with Problem(data.body, plan.build_material()) as problem:
-        for number in range(FRESH, FRESH + 2 * count):
-            load, factors = ramp_loads(data, plan, number)
-            try:
-                state = problem.solve(factors[-1] * load)
-            except NotConverged:
-                continue
-            if state.is_stable and len(found) < count:
-                found.append((factors[-1] * load, state.displacement))
-    return found
 
 
 def one(twin: Twin, load: Floats, truth: Floats, seed: int) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("--engine", default="surrogate")
     arguments = parser.parse_args()
     data = DataSet(arguments.folder / "data.zarr")
-    states = truths(data, STATES, None)
+    states = [state for _, state in truths(data, STATES)]
     shares = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, BETWEEN, endpoint=False))
     path = [
         (1.0 - share) * a + share * b for a, b in zip(states, states[1:] + states[:1], strict=True) for share in shares
