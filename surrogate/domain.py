@@ -13,7 +13,7 @@ from .model import Surrogate
 
 Floats = NDArray[np.float64]
 _LEAST_SPREAD = 1e-3  # of the largest: a direction hardly ever loaded must not make every load a far one
-_LOAD_MODES, _A_MODE = 64, 4  # at most so many, and one for so many loads: more tell no more (the small beam)
+_LOAD_MODES, _A_MODE = 64, 4  # at most so many, and one for so many loads
 _LEAST_REST = 1e-3  # of the mean square of a component
 
 
