@@ -238,6 +238,13 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
 @click.option("--smoothness", type=float, help="Correlation length of neighbouring forces, metres; 0: none.")
 @click.option("--directions", type=int, help="Most directions of force kept.")
 @click.option("--points", type=int, help="Most points of a cloud used; larger clouds are thinned.")
+@click.option(
+    "--distance",
+    type=click.Choice(["surface", "plane"]),
+    help="Of points to the surface, or to the planes of its triangles, along which they slide.",
+)
+@click.option("--normals", is_flag=True, default=None, help="Read the normals in the clouds' files: they pull, too.")
+@click.option("--normal-deviation", type=float, help="Standard deviation of such a normal across itself, degrees.")
 @click.option("--rounds", type=int, help="How often a cold start gathers the forces where it has found some.")
 @click.option("--solver", type=click.Choice(["gauss-newton", "l-bfgs"]), help="How the objective is minimised.")
 @click.option(

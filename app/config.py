@@ -228,6 +228,12 @@ class RegistrationSection(_Section):
     smoothness: float = Field(0.02, ge=0.0, description="correlation length of neighbouring forces, metres; 0: none")
     directions: Count = Field(64, description="most directions of force kept: those that a cloud tells best")
     points: Count = Field(1000, description="most points of a cloud used: larger ones are thinned")
+    distance: Literal["surface", "plane"] = Field(
+        "surface", description="of points to the surface, or to the planes of its triangles, along which they slide"
+    )
+    normals: bool = Field(False, description="clouds carry the normals of the surface seen, which pull, too")
+    normal_deviation: Positive = Field(10.0, description="standard deviation of a normal across itself, degrees")
+    budget: float = Field(0.0, ge=0.0, description="seconds for a frame, after which the best so far is taken; 0: none")
     rounds: int = Field(
         -1,
         ge=-1,

@@ -48,7 +48,7 @@ def identify_files(
         ConfigError, FileError, CloudError, PoseError, TwinError: what cannot be used, and why.
     """
     scene = Scene.of(place, options, unit)
-    clouds, found = find_clouds(names, scene.outside), list[Registration]()
+    clouds, found = find_clouds(names, scene.outside, scene.normals), list[Registration]()
     with scene.opened(start or Start(), say) as (twin, camera):
         frames = Frames(twin, None, camera)
         with Recorder(Exporter(twin, output, WRITTEN)) as recorder:

@@ -152,8 +152,9 @@ def watch_folder(
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"--watch: expected a folder, got the file {folder}.")
     scene = Scene.of(place, options, unit)
+    budget = scene.budget(budget)
     try:
-        source = WatchedFolder(folder, lambda path: CloudFile(path, scene.outside), idle=idle)
+        source = WatchedFolder(folder, lambda path: CloudFile(path, scene.outside, scene.normals), idle=idle)
     except ValueError as error:
         raise ConfigError(f"--idle: {error}") from None
     start = start or Start()

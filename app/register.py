@@ -43,21 +43,23 @@ class CloudFile:
     Args:
         path: its file.
         coordinates: unit and axes of the file.
+        normals: whether the normals in it are wanted.
     """
 
     path: Path
     coordinates: Coordinates
+    normals: bool = False
 
     def read(self) -> Floats:
-        """The points, (p, 3), metres.
+        """The points, (p, 3), metres, or with their normals (p, 6).
 
         Raises:
             FileError: the file is missing, damaged, or of no known kind.
         """
-        return read_cloud(self.path, self.coordinates.unit, self.coordinates.axes)
+        return read_cloud(self.path, self.coordinates.unit, self.coordinates.axes, self.normals)
 
 
-def find_clouds(names: Sequence[Path | str], coordinates: Coordinates) -> list[CloudFile]:
+def find_clouds(names: Sequence[Path | str], coordinates: Coordinates, normals: bool = False) -> list[CloudFile]:
     """The clouds that files, folders and patterns name; those of a folder or a pattern in the order of their numbers.
 
     Every file is read once, so that one that cannot be read is said before the first is registered; one that can be
@@ -66,11 +68,12 @@ def find_clouds(names: Sequence[Path | str], coordinates: Coordinates) -> list[C
     Args:
         names: files, folders, or patterns such as `clouds/*.ply`.
         coordinates: unit and axes of the files.
+        normals: whether the normals in them are wanted.
 
     Raises:
         FileError: nothing is there, or a file cannot be read.
     """
-    files = [CloudFile(path, coordinates) for name in names for path in _files_of(str(name))]
+    files = [CloudFile(path, coordinates, normals) for name in names for path in _files_of(str(name))]
     for file in tqdm(files, desc="reading", unit="cloud", disable=None if len(files) > 1 else True, leave=False):
         try:
             file.read()
@@ -194,14 +197,15 @@ def register_files(
         start: where the camera stands; in the body's coordinates if not given.
         truth: file of true node positions.
         formats: of the files of each frame; VTU and VTP if none.
-        budget: seconds for a frame, after which no step is begun; no limit if not given.
+        budget: seconds for a frame, after which no step is begun; what the configuration says if not given.
         say: prints a line.
 
     Raises:
         ConfigError, FileError, CloudError, PoseError, TwinError: what cannot be used, and why.
     """
     scene = Scene.of(place, options, unit)
-    clouds = find_clouds(names, scene.outside)
+    clouds = find_clouds(names, scene.outside, scene.normals)
+    budget = scene.budget(budget)
     positions = None if truth is None else read_truth(truth, len(clouds), scene.home.body, scene.inside)
     start = start or Start()
     marks = scene.marks(start, [cloud.path for cloud in clouds])
@@ -244,6 +248,17 @@ class Scene:
         home = twins.find_twin(place)
         inside = coordinates_of(twins.with_options(home.config, dict(options)))
         return cls(home, options, inside, replace(inside, unit=unit or inside.unit))
+
+    @property
+    def normals(self) -> bool:
+        """Whether the normals in the clouds' files are wanted."""
+        return twins.with_options(self.home.config, dict(self.options)).registration.normals
+
+    def budget(self, given: float | None) -> float | None:
+        """Seconds for a frame: those given, or the configuration's; None for no limit."""
+        if given is not None:
+            return given
+        return twins.with_options(self.home.config, dict(self.options)).registration.budget or None
 
     def marks(self, start: Start, clouds: Sequence[Path] | None = None) -> MarkFiles | None:
         """What pulls beside the clouds; None where nothing was given.

@@ -22,6 +22,7 @@ from softtwin.meshes.files import read_body
 from softtwin.reference.data.discrepancy import Discrepancy, read_discrepancy
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import loaded_nodes
+from softtwin.registration.cloud import Cloud, turned
 from softtwin.registration.conditions import Conditions
 from softtwin.registration.contact import ContactRegistrar
 from softtwin.registration.evidence import Scale
@@ -42,7 +43,6 @@ from softtwin.registration.registrar import (
 )
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.rigid import align
-from softtwin.registration.thinning import thinned
 from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Judgement, Verdict
 
@@ -227,7 +227,7 @@ class Twin:
         """The forces and the state that explain a cloud, with a verdict on them.
 
         Args:
-            cloud: observed points, (p, 3), metres.
+            cloud: observed points, (p, 3), metres; with normals measured there behind them (p, 6): they pull, too.
             zone: node set whose nodes may carry force; empty for all loaded nodes; what the configuration says if not
                 given.
             start: result of an earlier frame to start from; no force if not given.
@@ -304,7 +304,8 @@ class Twin:
     ) -> Registration:
         points = np.asarray(cloud, dtype=np.float64)
         if isinstance(camera, Pose):
-            return replace(run(self.registrar(zone), camera.inverse().apply(points)), pose=camera)
+            back = camera.inverse()
+            return replace(run(self.registrar(zone), turned(points, back.rotation, back.translation)), pose=camera)
         assert camera != "align"
         return run(self.registrar(zone, camera), points)
 
@@ -357,7 +358,7 @@ class Twin:
         Raises:
             CloudError: no pose explains the cloud, or more than one does.
         """
-        found = align(Surface(outer(self.body).rest.points, self._seen), cloud)
+        found = align(Surface(outer(self.body).rest.points, self._seen), Cloud.of(cloud).points)
         if not found.is_found:
             raise CloudError(f"cloud: the pose was not found ({found.outcome.value}). {found.outcome.advice}")
         return self.near(found.pose)
@@ -474,8 +475,8 @@ class Sequence:
             ConfigError, ValueError: landmarks that the twin cannot take.
         """
         begin = time.perf_counter()
-        points = self._thinned(cloud)
         try:
+            points = self._thinned(cloud)
             if self.camera == "align":
                 self.camera = self.twin.aligned(points)
             result = self.twin.follow(points, self.zone, self._last, self.camera, until, landmarks)
@@ -484,14 +485,12 @@ class Sequence:
         if result.judgement.is_usable:
             self._last = result
         count = 0 if landmarks is None else len(np.asarray(landmarks[0]))
-        return Frame(self._next(), result.judgement, result, time.perf_counter() - begin, points, count)
+        return Frame(self._next(), result.judgement, result, time.perf_counter() - begin, points[:, :3], count)
 
     def _thinned(self, cloud: ArrayLike) -> Floats:
         """Once for all that is tried with it; what is no cloud is left for the registrar to refuse."""
-        points = np.asarray(cloud, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-            return points
-        return points[thinned(points, self.twin.config.registration.points)]
+        given = Cloud.of(cloud)
+        return (given.thinned(self.twin.config.registration.points) if given.is_finite else given).array()
 
     def refuse(self, reason: str, seconds: float = 0.0) -> Frame:
         """The next frame without a result: its cloud cannot be used.
@@ -526,7 +525,15 @@ def _options(section: RegistrationSection, suited: RegistrationOptions) -> Regis
     gathering = suited.gathering
     if section.rounds >= 0:
         gathering = replace(gathering, rounds=section.rounds)
-    return replace(suited, noise=noise, solver=solver, most_points=section.points, gathering=gathering)
+    return replace(
+        suited,
+        noise=noise,
+        solver=solver,
+        most_points=section.points,
+        gathering=gathering,
+        distance=section.distance,
+        normal_deviation=float(np.deg2rad(section.normal_deviation)),
+    )
 
 
 def with_options(config: Config, options: dict[str, Any]) -> Config:

@@ -86,7 +86,7 @@ def case(name: str) -> Case:
     """
     if name == "liver":
         loads = LoadPlan(patches=5, displacement=0.055)
-        return Case("4.3", liver, Plan("neo-hookean", 5000.0, 0.45, loads, {"train": 1024, **HELD_OUT}), 8, 192)
+        return Case("4.3", liver, Plan("neo-hookean", 5000.0, 0.45, loads, {"train": 2048, **HELD_OUT}), 8, 192)
     if name == "liver-tetrahedra":  # for certificates.py
         loads = LoadPlan(patches=5, displacement=0.055)
         samples = {"train": 1024, "validation": 128, "test": 1000, "calibration": 1000}

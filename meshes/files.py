@@ -26,7 +26,7 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridRead
 
 from .body import Body, Floats, Ints, Surface, corner_jacobians
 from .elements import KINDS
-from .ply import read_ply
+from .ply import read_ply, read_ply_normals
 
 Unit = Literal["m", "cm", "mm"]
 Frame = Literal["lps", "ras"]
@@ -40,6 +40,8 @@ _MESHIO = (".stl", ".obj", ".msh")
 _VTK: Mapping[str, Any] = {".vtk": vtkDataSetReader, ".vtu": vtkXMLUnstructuredGridReader, ".vtp": vtkXMLPolyDataReader}
 _FIRST_MSH = {1: "line", 2: "triangle", 3: "quad", 4: "tetra", 5: "hexahedron", 15: "vertex"}  # gmsh's element types
 _TEXT = (".txt", ".csv", ".xyz")
+_PCD = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
+_TURN = np.array([-1.0, -1.0, 1.0])  # from RAS to LPS and back
 _VTK_NODES = {kind.vtk: (kind.name, kind.nodes) for kind in KINDS.values()}
 _LAST_LINES = 100  # of a text cloud, to see how its numbers end
 _HEAD = 2048  # bytes in which a file says what it is
@@ -149,23 +151,39 @@ def read_volume(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> tupl
     return _volume(Path(path), _read(path), unit, axes)
 
 
-def read_cloud(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Floats:
-    """The points of a file, (p, 3), metres.
+def read_cloud(path: str | Path, unit: Unit = "m", axes: Frame = "lps", normals: bool = False) -> Floats:
+    """The points of a file, (p, 3), metres; with the normals measured there (p, 6).
 
     Args:
         path: text with three columns (TXT, CSV, XYZ), NPY, PCD (points without a measurement, NaN, are left out), or
             any mesh file whose points are taken.
         unit: the file's unit of length.
         axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign).
+        normals: read them, too: columns 4 to 6 of a table, `nx`, `ny`, `nz` of a PLY, `normal_x` and so on of a PCD,
+            the normals of a VTK file. NaN or zeros where none was measured.
 
     Raises:
-        FileError: missing, empty, damaged or unknown file, or not three columns of finite numbers.
+        FileError: missing, empty, damaged or unknown file, or not three columns of finite numbers; no normals where
+            they are asked for.
     """
     path = _existing(path)
     suffix = path.suffix.lower()
-    points = (
-        _read_table(path) if suffix in (*_TEXT, ".npy") else _read_pcd(path) if suffix == ".pcd" else _read(path).points
-    )
+    if suffix in (*_TEXT, ".npy"):
+        points = _read_table(path)
+    elif suffix == ".pcd":
+        points = _read_pcd(path, _PCD[: 6 if normals else 3])
+    else:
+        points = _read(path).points
+    facing: Floats | None = None
+    if normals:
+        if suffix in (*_TEXT, ".npy", ".pcd"):
+            is_table = points.ndim == 2 and points.shape[1] == 6
+            points, facing = (points[:, :3], points[:, 3:]) if is_table else (points, None)
+        else:
+            facing = _vertex_normals(path)
+        if facing is None or facing.shape != points.shape:
+            got = "none" if facing is None else f"shape {facing.shape}"
+            raise FileError(f"{path}: expected a normal for each point, got {got}; without --normals it can be used.")
     if points.ndim != 2 or points.shape[1] != 3:
         raise FileError(f"{path}: expected a cloud of shape (p, 3), got {points.shape}.")
     if len(points) == 0:
@@ -175,7 +193,22 @@ def read_cloud(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Float
         raise ContentError(
             f"{path}: expected finite coordinates, got NaN or infinity in {bad} of {len(points)} points; remove them."
         )
-    return _placed(path, points, unit, axes, smallest=0.0)
+    placed = _placed(path, points, unit, axes, smallest=0.0)
+    return placed if facing is None else np.hstack([placed, facing * (_TURN if axes == "ras" else 1.0)])
+
+
+def _vertex_normals(path: Path) -> Floats | None:
+    """Normals of the points of a mesh file, (p, 3), as they stand in it; None where it has none."""
+    suffix, found = path.suffix.lower(), None
+    if suffix == ".ply":
+        found = read_ply_normals(path)
+    elif suffix in _VTK:
+        data = _read_vtk(path).GetPointData()
+        names = [data.GetArrayName(i) for i in range(data.GetNumberOfArrays())]
+        named = [name for name in names if name and name.lower() == "normals"]
+        array = data.GetNormals() or (data.GetArray(named[0]) if named else None)
+        found = None if array is None else vtk_to_numpy(array)
+    return None if found is None else np.asarray(found, dtype=np.float64)
 
 
 def write_body(path: str | Path, body: Body, fields: Mapping[str, ArrayLike] | None = None) -> None:
@@ -487,18 +520,20 @@ def _is_cut(lines: list[str]) -> bool:
     return len(ends) > 2 and len(shapes) == 1 and len(ends[-1]) < len(ends[0])
 
 
-def _read_pcd(path: Path) -> Floats:
+def _read_pcd(path: Path, fields: tuple[str, ...]) -> Floats:
     from pypcd4.pypcd4 import PointCloud  # drags pydantic's models in: only where a PCD comes
 
     try:
         cloud = PointCloud.from_path(path)
-        points = np.asarray(cloud.numpy(("x", "y", "z")), dtype=np.float64)
+        if missing := [name for name in fields if name not in cloud.fields]:
+            raise ValueError(f"expected the fields {', '.join(fields)}, and {missing[0]} is missing")
+        points = np.asarray(cloud.numpy(fields), dtype=np.float64)
         if len(points) != cloud.points:
             raise ValueError(f"expected {cloud.points} points, got {len(points)}")
     except Exception as error:  # of pydantic, struct and lzf, each with its own
         raise FileError(f"{path}: could not be read as pcd; the file may be truncated or damaged "
                         f"({' '.join(str(error).split())[:200]}).") from error  # fmt: skip
-    return points[~np.isnan(points).any(axis=1)]  # NaN stands for a pixel without a measurement
+    return points[~np.isnan(points[:, :3]).any(axis=1)]  # NaN stands for a pixel without a measurement
 
 
 def _is_numeric(line: str) -> bool:
@@ -547,7 +582,7 @@ def _placed(path: Path, points: Floats, unit: Unit, axes: Frame, smallest: float
         raise ValueError(f"axes: expected 'lps' or 'ras', got {axes!r}.")
     points = in_metres(points, unit)
     if axes == "ras":
-        points = points * np.array([-1.0, -1.0, 1.0])
+        points = points * _TURN
     _warn_size(path, float(np.ptp(points, axis=0).max()), unit, smallest)
     return points
 

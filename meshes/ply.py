@@ -51,18 +51,38 @@ def read_ply(path: Path) -> tuple[Floats, Ints]:
     Raises:
         ValueError: no PLY, cut off, or without coordinates.
     """
+    columns = _columns(path)
+    vertices = columns.get("vertex", {})
+    if not {"x", "y", "z"} <= set(vertices):
+        raise ValueError("expected vertices with x, y and z")
+    points = np.column_stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"])
+    return points, _triangles(columns)
+
+
+def read_ply_normals(path: Path) -> Floats | None:
+    """The normals of a file's points, (p, 3); None where it has none.
+
+    Args:
+        path: the file.
+
+    Raises:
+        ValueError: no PLY, or cut off.
+    """
+    vertices = _columns(path).get("vertex", {})
+    if not {"nx", "ny", "nz"} <= set(vertices):
+        return None
+    return np.column_stack([np.asarray(vertices[f"n{axis}"], dtype=np.float64) for axis in "xyz"])
+
+
+def _columns(path: Path) -> dict[str, dict[str, Column]]:
+    """All properties of all elements, by their names."""
     content = path.read_bytes()
     end = re.search(rb"\nend_header\s*?\n", content)
     if not content.startswith(b"ply") or end is None:
         raise ValueError("expected a header from 'ply' to 'end_header'")
     order, elements = _header(content[: end.start()].decode("latin-1").replace("\r", "\n").split("\n"))
     body = content[end.end() :]
-    columns = _text_columns(body, elements) if not order else _binary_columns(body, elements, order)
-    vertices = columns.get("vertex", {})
-    if not {"x", "y", "z"} <= set(vertices):
-        raise ValueError("expected vertices with x, y and z")
-    points = np.column_stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"])
-    return points, _triangles(columns)
+    return _text_columns(body, elements) if not order else _binary_columns(body, elements, order)
 
 
 def _header(lines: list[str]) -> tuple[str, list[_Element]]:

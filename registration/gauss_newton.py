@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -313,24 +314,17 @@ class LocalModel:
         self.precision[problem.force_part] = 1.0 / self.scales.force**2
         trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
         self.information = trusted.T @ trusted
-        self._marked(problem.mark_residuals(trial))
-        self._hessian = self.information + self.mark_information + np.diag(self.precision)
+        off, leaning = problem.mark_residuals(trial), problem.normal_residuals(trial)
+        self.mark_information, by_marks = _told(off, marks.LOSS, lambda: problem.mark_jacobian(trial))
+        self.normal_information, by_normals = _told(leaning, loss, lambda: problem.normal_jacobian(trial))
+        self._beside = by_marks + by_normals
+        self._hessian = self.information + self.mark_information + self.normal_information + np.diag(self.precision)
         self.gradient = self._gradient(residuals, self.weights)
         self.value = self.objective(trial, loss)
 
-    def _marked(self, off: Floats) -> None:
-        """What landmarks tell; they carry their own deviation, and the scales are found from the cloud alone."""
-        size = self.problem.size
-        self.mark_information, self._mark_gradient = np.zeros((size, size)), np.zeros(size)
-        if len(off):
-            jacobian = self.problem.mark_jacobian(self.trial)
-            weights = marks.LOSS.weight(off)
-            self.mark_information = (weights[:, None] * jacobian).T @ jacobian
-            self._mark_gradient = (weights * off) @ jacobian
-
     def _gradient(self, residuals: Floats, weights: Floats) -> Floats:
         by_distances = weights * residuals / self.deviations**2
-        return by_distances @ self.jacobian + self.precision * self.trial.coefficients + self._mark_gradient
+        return by_distances @ self.jacobian + self.precision * self.trial.coefficients + self._beside
 
     def _found_scales(self, loss: Loss, noise: float, left_out: Floats, graduation: float) -> tuple[Scales, bool]:
         """Scales, and whether the noise is held above what the linear model alone would believe: the points' own."""
@@ -385,8 +379,10 @@ class LocalModel:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ trial.coefficients**2)
         scaled = self.problem.residuals(trial, self.own) / self.deviations
-        off = marks.LOSS.value(self.problem.mark_residuals(trial))
-        return float(loss.value(scaled).sum()) + float(off.sum()) + prior
+        off = self.problem.mark_residuals(trial)
+        leaning = self.problem.normal_residuals(trial, self.trial.match)
+        beside = float(marks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
+        return float(loss.value(scaled).sum()) + beside + prior
 
     @property
     def length(self) -> float:
@@ -429,13 +425,29 @@ class LocalModel:
             alike: so many points tell what one would that errs by itself.
         """
         count = self.problem.forces.size
-        told = self.information / alike + self.mark_information
+        told = (self.information + self.normal_information) / alike + self.mark_information
         return posterior(told, self.precision, self.trial.coefficients, self.scales, count)
 
     def alike(self) -> float:
         """How many points tell what one would that errs by itself, as the residuals here have it; see `inflation`."""
         scaled = self.problem.residuals(self.trial, self.own) / self.deviations
         return inflation(self.problem.observed.feet(self.trial.match), scaled, self.weights)
+
+
+def _told(off: Floats, loss: Loss, jacobian: Callable[[], Floats]) -> tuple[Floats | float, Floats | float]:
+    """Information, (k, k), and gradient, (k,), of what pulls beside the distances and carries its own deviation.
+
+    The scales of noise and forces are found from the distances alone.
+
+    Args:
+        off: residuals over their deviations, (r,); there may be none.
+        loss: of each.
+        jacobian: their derivative by the coefficients, (r, k).
+    """
+    if not len(off):
+        return 0.0, 0.0
+    slopes, weights = jacobian(), loss.weight(off)
+    return (weights[:, None] * slopes).T @ slopes, (weights * off) @ slopes
 
 
 def _length(step: Floats, gradient: Floats) -> float:

@@ -169,8 +169,11 @@ def _objective(problem: Problem, trial: Trial, loss: Loss, local: LocalModel) ->
     scaled = problem.residuals(trial, local.own) / local.deviations
     slope = loss.weight(scaled) * scaled / local.deviations
     value, gradient = float(loss.value(scaled).sum()), problem.pulled(trial, slope)
-    if problem.marks is None:
-        return value, gradient
-    off = problem.mark_residuals(trial)
-    gradient = gradient + problem.marks_pulled(trial, marks.LOSS.weight(off) * off)
-    return value + float(marks.LOSS.value(off).sum()), gradient
+    off, held = problem.mark_residuals(trial), local.trial.match
+    leaning = problem.normal_residuals(trial, held)
+    value += float(marks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
+    if len(off):
+        gradient = gradient + problem.marks_pulled(trial, marks.LOSS.weight(off) * off)
+    if len(leaning):
+        gradient = gradient + problem.normals_pulled(trial, loss.weight(leaning) * leaning, held)
+    return value, gradient

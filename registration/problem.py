@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from .cloud import Cloud
 from .conditions import Conditions
 from .evidence import Scale
 from .forward import ConditionedModel, ConditionedState, ReducedModel, ReducedState
@@ -21,6 +22,8 @@ from .unknowns import Forces, ModelError, PosePrior
 
 Floats = NDArray[np.float64]
 _WATCHED = 300  # nodes whose movement limits a step
+# Radians, of a measured normal across itself: cameras' are off by some 10 degrees, and flat triangles by some more.
+NORMAL_DEVIATION = float(np.deg2rad(10.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,9 @@ class Problem:
         error: what the model may get wrong; None where it is not known in patterns.
         conditions: unknowns beside the forces, which the model takes; None where there are none.
         marks: landmarks that pull beside the cloud; None where there are none.
+        across: two unit vectors across each point's measured normal, in the cloud's coordinates, (p, 2, 3): how far the
+            surface leans towards them pulls, too; None for a cloud without normals.
+        leaning: standard deviation of that, radians.
     """
 
     model: ReducedModel
@@ -69,6 +75,18 @@ class Problem:
     error: ModelError | None = None
     conditions: Conditions | None = None
     marks: Marks | None = None
+    across: Floats | None = None
+    leaning: float = NORMAL_DEVIATION
+
+    @classmethod
+    def seen(cls, cloud: Cloud, **given: Any) -> Problem:
+        """The problem of a cloud with its normals, where it has some.
+
+        Args:
+            cloud: points with or without normals.
+            given: all other arguments.
+        """
+        return cls(cloud=cloud.points, across=cloud.across, **given)
 
     @property
     def size(self) -> int:
@@ -202,6 +220,51 @@ class Problem:
             return np.zeros(self.size)
         rows = self.marks.rows(self.observed) / self.marks.deviation
         return self._pulled(trial, rows, self._marks_by_pose(trial), cotangent)
+
+    def normal_residuals(self, trial: Trial, held: Match | None = None) -> Floats:
+        """How far the surface leans from the normals measured, over its deviation, (2p,): two directions a point.
+
+        A normal counts up to its sign. A surface that is turned by an angle leans by its sine.
+
+        Args:
+            trial: at some coefficients.
+            held: a match whose triangles are looked at; the trial's if not given. Where closest points go on to the
+                next triangle these residuals jump: who compares two trials holds them.
+        """
+        if self.across is None:
+            return np.zeros(0)
+        facing = self.observed.facing(held or trial.match, trial.positions)
+        return np.einsum("pqi,pi->pq", self._across(trial), facing).ravel() / self.leaning
+
+    def normal_jacobian(self, trial: Trial) -> Floats:
+        """Derivative of these by the coefficients, (2p, k), exact for triangles that are held."""
+        if self.across is None:
+            return np.zeros((0, self.size))
+        match = trial.match
+        return self._by_coefficients(trial, self._normal_rows(trial, match), self._normals_by_pose(trial, match))
+
+    def normals_pulled(self, trial: Trial, cotangent: Floats, held: Match | None = None) -> Floats:
+        """Gradient by the coefficients, (k,), from the one by the normals' residuals, (2p,), with the adjoint."""
+        if self.across is None:
+            return np.zeros(self.size)
+        match = held or trial.match
+        return self._pulled(trial, self._normal_rows(trial, match), self._normals_by_pose(trial, match), cotangent)
+
+    def _across(self, trial: Trial) -> Floats:
+        """In the body's coordinates."""
+        assert self.across is not None
+        return self.across if trial.pose is None else self.across @ trial.pose.rotation
+
+    def _normal_rows(self, trial: Trial, match: Match) -> csr_array:
+        return self.observed.facing_rows(match, trial.positions, self._across(trial) / self.leaning)
+
+    def _normals_by_pose(self, trial: Trial, match: Match) -> Floats | None:
+        """A direction of the body turns with the pose, and is not shifted: a point's derivative less the origin's."""
+        facing = np.repeat(self.observed.facing(match, trial.positions), 2, axis=0)
+        along = (self._across(trial) / self.leaning).reshape(-1, 3)
+        turned = self._by_pose(trial, along, facing)
+        at_origin = self._by_pose(trial, along, np.zeros_like(facing))
+        return None if turned is None or at_origin is None else turned - at_origin
 
     def _found_marks(self, trial: Trial) -> Floats:
         """Where the landmarks were found, in the body's coordinates, (l, 3)."""

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +17,7 @@ from softtwin.meshes.clouds import check_cloud
 from softtwin.meshes.metrics import edge_lengths
 from softtwin.reference.data.outcome import NotConverged
 
+from .cloud import Cloud
 from .conditions import Conditions, Estimate
 from .evidence import Scale
 from .forward import ForwardModel, ReducedModel, State, reduce_model
@@ -28,9 +28,8 @@ from .marks import Marks
 from .outcome import Outcome
 from .pose import Pose
 from .posterior import Posterior
-from .problem import Problem, Trial
-from .residuals import SurfaceDistance
-from .thinning import thinned
+from .problem import NORMAL_DEVIATION, Problem, Trial
+from .residuals import Distance, SurfaceDistance
 from .uncertainty import Uncertainty, uncertainty, unseen_response
 from .unknowns import Forces, Informed, ModelError, PosePrior, contact, known_forces, nodal_forces, told, windowed
 from .verdict import Expectations, Judgement, Verdict, judge, shared
@@ -103,6 +102,8 @@ class RegistrationOptions:
         gathering: how a cold start finds where forces act.
         belief: when the size of the forces is left to the cloud.
         thorough: part of what the solver calls settled that a cold start has to reach.
+        distance: of points to the surface, or to the planes of its triangles; see `SurfaceDistance`.
+        normal_deviation: standard deviation of a measured normal across itself, radians.
     """
 
     noise: Scale = NOISE
@@ -111,8 +112,16 @@ class RegistrationOptions:
     gathering: Gathering = field(default_factory=Gathering)
     belief: Belief = field(default_factory=Belief)
     thorough: float = 1.0
+    distance: Distance = "surface"
+    normal_deviation: float = NORMAL_DEVIATION
 
     def __post_init__(self) -> None:
+        if self.distance not in ("surface", "plane"):
+            raise ValueError(f"RegistrationOptions.distance: expected surface or plane, got {self.distance!r}.")
+        if not 0.0 < self.normal_deviation < np.inf:
+            raise ValueError(
+                f"RegistrationOptions.normal_deviation: expected a positive angle, got {self.normal_deviation}."
+            )
         if self.most_points < 1:
             raise ValueError(f"RegistrationOptions.most_points: expected at least 1, got {self.most_points}.")
         if not 0.0 < self.thorough <= 1.0:
@@ -353,7 +362,7 @@ class Registrar:
         """The forces, the state and the pose that bring the observed side to a cloud.
 
         Args:
-            cloud: observed points, (p, 3), metres.
+            cloud: observed points, (p, 3), metres; with the normals measured there behind them (p, 6): see `Cloud`.
             start: an earlier frame's result to start from; no force if not given.
 
         Raises:
@@ -444,20 +453,21 @@ class Registrar:
             return warm
         return min(warm, self.register(cloud), key=badness)
 
-    def _plain(self, points: Floats, prepared: Prepared) -> Problem:
+    def _plain(self, points: Cloud, prepared: Prepared) -> Problem:
         """The problem with the model's error as the least noise."""
-        return Problem(
-            prepared.model,
-            self.observed,
-            prepared.forces,
-            self.pose,
+        return Problem.seen(
             points,
-            self.noise,
+            model=prepared.model,
+            observed=self.observed,
+            forces=prepared.forces,
+            pose=self.pose,
+            noise=self.noise,
             conditions=self.conditions,
             marks=self.marks,
+            leaning=self.options.normal_deviation,
         )
 
-    def _problem(self, points: Floats, prepared: Prepared, near: Trial, doubt: float = 1.0) -> Problem:
+    def _problem(self, points: Cloud, prepared: Prepared, near: Trial, doubt: float = 1.0) -> Problem:
         """The problem with the model's error in patterns, of the size that belongs to a movement like a trial's."""
         plain = self._plain(points, prepared)
         if self.error is None:
@@ -466,10 +476,10 @@ class Registrar:
         error = replace(self.error, size=doubt * float(moved))
         return replace(plain, error=error, noise=self.options.noise)
 
-    def _cold(self, points: Floats, begin: float) -> Registration:
+    def _cold(self, points: Cloud, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more for each round of gathering them."""
         prepared, gathering, solver = self._everywhere, self.options.gathering, self._thorough
-        few, is_gathered = _thinned(points, gathering.points), gathering.rounds > 0
+        few, is_gathered = points.thinned(gathering.points), gathering.rounds > 0
         begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
         found = self._from_rest(*begun)
         for left in reversed(range(gathering.rounds)):
@@ -479,9 +489,9 @@ class Registrar:
             found = _after(found, self._from_rest(few if left else points, prepared, solver))
         return self._finished(points, prepared, found, begin, is_gathered)
 
-    def _from_rest(self, points: Floats, prepared: Prepared, solver: GaussNewton | LBFGS) -> Found:
+    def _from_rest(self, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> Found:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
-        few, first = _thinned(points, self.options.gathering.points), prepared.leading(_LEADING)
+        few, first = points.thinned(self.options.gathering.points), prepared.leading(_LEADING)
         rough, problem = self._plain(few, first), self._plain(points, prepared)
         begun = solver.rough().solve(rough, np.zeros(rough.size))
         start = np.zeros(problem.size)
@@ -493,7 +503,7 @@ class Registrar:
         return _after(begun, solver.solve(problem, start, begun.trial))
 
     def _finished(
-        self, points: Floats, prepared: Prepared, found: Found, begin: float, is_settled: bool = True
+        self, points: Cloud, prepared: Prepared, found: Found, begin: float, is_settled: bool = True
     ) -> Registration:
         """With all points, and with the model's error in patterns, from a result that took it for noise."""
         solver, doubt, is_hopeless = self._thorough, 1.0, self._is_hopeless(found)
@@ -572,15 +582,15 @@ class Registrar:
         """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
         return result.noise > _LEFT * max(start.noise, self.noise.least)
 
-    def _checked(self, cloud: ArrayLike) -> Floats:
-        points = np.asarray(cloud, dtype=np.float64)
-        if points.ndim == 2 and points.shape[1:] == (3,):
-            finite: Any = np.isfinite(points).all()
-            points = _thinned(points, self.options.most_points) if finite else points
-        if self.pose is not None and points.ndim == 2 and points.shape[1:] == (3,):
-            check_cloud(self.pose.mean.inverse().apply(points), self.model.body)
-            return points
-        return check_cloud(points, self.model.body)
+    def _checked(self, cloud: ArrayLike) -> Cloud:
+        given = Cloud.of(cloud)
+        if given.is_finite:
+            given = given.thinned(self.options.most_points)
+            if self.pose is not None:
+                check_cloud(self.pose.mean.inverse().apply(given.points), self.model.body)
+                return given
+        check_cloud(given.points, self.model.body)
+        return given
 
     def _result(self, problem: Problem, found: Found, prepared: Prepared, begin: float, doubt: float) -> Registration:
         alike = found.local.alike()
@@ -651,7 +661,7 @@ def prepare(
         ValueError: no node is left on the free boundary; nothing is unknown; conditions that the model does not take.
     """
     options = options or RegistrationOptions()
-    observed = SurfaceDistance(model.body, triangles)
+    observed = SurfaceDistance(model.body, triangles, options.distance)
     scale = Scale(force_scale, _SPREAD, least=1e-2 * force_scale)
     if nodes is None:
         if conditions is None and pose is None:
@@ -717,10 +727,6 @@ def expected_force(body: Body, young_modulus: float) -> float:
     """Nodal force to begin with, newtons: 1 % of Young's modulus (Pa) over the square of a typical edge."""
     edge = float(np.median(edge_lengths(body.points, body.cells)))
     return 0.01 * young_modulus * edge**2
-
-
-def _thinned(points: Floats, most: int) -> Floats:
-    return points if len(points) <= most else points[thinned(points, most)]
 
 
 def badness(result: Registration) -> tuple[int, float]:

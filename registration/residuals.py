@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,8 @@ from softtwin.meshes.embedding import outer
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Distance = Literal["surface", "plane"]
+_BESIDE = 1.0  # triangles: a point that lies further beside its own is measured to the surface all the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +30,15 @@ class Match:
         directions: unit vectors in which each distance grows, (p, 3).
         triangles: triangle that holds each closest point, (p,).
         weights: barycentric weights of the closest points, (p, 3).
+        levers: those of the points that distances are measured to, (p, 3): the closest points, or the feet on the
+            planes of their triangles.
     """
 
     distances: Floats
     directions: Floats
     triangles: Ints
     weights: Floats
+    levers: Floats
 
     @property
     def rms(self) -> float:
@@ -47,10 +53,12 @@ class SurfaceDistance:
         body: the body.
         triangles: the observed side as vertex numbers of the organ's own surface (which are node numbers where that
             is the boundary of the cells), (t, 3); all of it if not given.
+        distance: to the `surface`, or to the `plane` of the triangle that holds the closest point: it slides along the
+            surface freely (Chen and Medioni 1992), and at an edge of what is seen pulls nothing sideways.
     """
 
-    def __init__(self, body: Body, triangles: ArrayLike | None = None) -> None:
-        self.body = body
+    def __init__(self, body: Body, triangles: ArrayLike | None = None, distance: Distance = "surface") -> None:
+        self.body, self.distance = body, distance
         surface = outer(body)
         chosen = surface.rest.triangles if triangles is None else np.asarray(triangles, dtype=np.int64)
         vertices, local = np.unique(chosen, return_inverse=True)
@@ -114,13 +122,47 @@ class SurfaceDistance:
         corners = positions[self.triangles[triangles]]
         offsets = np.einsum("pk,pki->pi", weights, corners) - cloud
         lengths = np.sqrt(np.einsum("pi,pi->p", offsets, offsets))
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.sqrt(np.einsum("pi,pi->p", normals, normals))[:, None]
+        normals, doubled = _normals(corners)
         # On the surface itself the offset has no direction: the normal is its limit.
         on_it = lengths < 1e-12 * self.body.size
         directions = np.where(on_it[:, None], normals, offsets / np.where(on_it, 1.0, lengths)[:, None])
         side = np.where(np.einsum("pi,pi->p", directions, normals) < 0.0, -1.0, 1.0)
-        return Match(side * lengths, side[:, None] * directions, triangles, weights)
+        match = Match(side * lengths, side[:, None] * directions, triangles, weights, weights)
+        return match if self.distance == "surface" else _to_planes(match, corners, cloud, normals, doubled)
+
+    def facing(self, match: Match, displacement: Floats) -> Floats:
+        """Unit normals of the moved triangles that hold a match's closest points, (p, 3).
+
+        Args:
+            match: of a cloud.
+            displacement: of the nodes `nodes`, (m, 3), metres.
+        """
+        return _normals((self.rest + self._carried(displacement))[self.triangles[match.triangles]])[0]
+
+    def facing_rows(self, match: Match, displacement: Floats, along: Floats) -> csr_array:
+        """Derivative of these normals' components along vectors, (p q, 3m), by the displacement of the nodes.
+
+        Exact while each closest point stays on its triangle, whose normal depends on its three corners alone.
+
+        Args:
+            match: of a cloud.
+            displacement: of the nodes `nodes`, (m, 3), metres.
+            along: q vectors for each point, (p, q, 3).
+        """
+        corners = (self.rest + self._carried(displacement))[self.triangles[match.triangles]]
+        normals, doubled = _normals(corners)
+        first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        # t . dn = q . (d first x second + first x d second) with q = (t - (t . n) n) / |first x second|
+        tangent = along - np.einsum("pqi,pi->pq", along, normals)[:, :, None] * normals[:, None]
+        tangent /= doubled[:, None, None]
+        by_second = np.cross(second[:, None], tangent)
+        by_third = np.cross(tangent, first[:, None])
+        values = np.stack([-by_second - by_third, by_second, by_third], axis=2)  # (p, q, corner, axis)
+        count = along.shape[0] * along.shape[1]
+        columns = (3 * self.triangles[match.triangles][:, :, None] + np.arange(3)).reshape(-1, 1, 9)
+        columns = np.broadcast_to(columns, (along.shape[0], along.shape[1], 9))
+        indptr = np.arange(0, 9 * count + 1, 9)
+        return self.by_nodes(csr_array((values.ravel(), columns.ravel(), indptr), shape=(count, 3 * len(self.rest))))
 
     def feet(self, match: Match) -> Floats:
         """The closest points of a match on the surface at rest, (p, 3), metres."""
@@ -148,11 +190,11 @@ class SurfaceDistance:
     def rows(self, match: Match) -> csr_array:
         """Derivative of the distances with respect to the displacement of the observed nodes, (p, 3m).
 
-        Exact: by the envelope theorem the closest point may be held fixed on its triangle.
+        Exact: by the envelope theorem the closest point, or the foot, may be held fixed on its triangle.
         """
         count = len(match.distances)
         columns = (3 * self.triangles[match.triangles][:, :, None] + np.arange(3)).reshape(count, 9)
-        values = (match.weights[:, :, None] * match.directions[:, None, :]).reshape(count, 9)
+        values = (match.levers[:, :, None] * match.directions[:, None, :]).reshape(count, 9)
         indptr = np.arange(0, 9 * count + 1, 9)
         return self.by_nodes(csr_array((values.ravel(), columns.ravel(), indptr), shape=(count, 3 * len(self.rest))))
 
@@ -195,3 +237,27 @@ class SurfaceDistance:
             np.add.at(share, self.triangles[:, corner], np.linalg.norm(areas, axis=1) / 3.0)
         lengths = np.maximum(np.linalg.norm(sums, axis=1), 1e-300)
         return sums / lengths[:, None], share / share.sum()
+
+
+def _normals(corners: Floats) -> tuple[Floats, Floats]:
+    """Unit normals of triangles, (p, 3), and twice their areas, (p,)."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    doubled = np.sqrt(np.einsum("pi,pi->p", normals, normals))
+    return normals / doubled[:, None], doubled
+
+
+def _to_planes(match: Match, corners: Floats, cloud: Floats, normals: Floats, doubled: Floats) -> Match:
+    """The same match with distances to the planes of the triangles, but of points far beside their own."""
+    first, second, arm = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], cloud - corners[:, 0]
+    feet = np.empty_like(match.weights)
+    feet[:, 1] = np.einsum("pi,pi->p", np.cross(arm, second), normals) / doubled
+    feet[:, 2] = np.einsum("pi,pi->p", np.cross(first, arm), normals) / doubled
+    feet[:, 0] = 1.0 - feet[:, 1] - feet[:, 2]
+    near = (feet > -_BESIDE).all(axis=1)
+    return Match(
+        np.where(near, -np.einsum("pi,pi->p", arm, normals), match.distances),
+        np.where(near[:, None], normals, match.directions),
+        match.triangles,
+        match.weights,
+        np.where(near[:, None], feet, match.levers),
+    )

@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 _NEIGHBOURS = 6
 _ASKED = 250  # points at least, whose neighbours are looked at
 _MARK_OFF = 4.0  # deviations of a landmark's place; three axes together are beyond it once in a thousand
+_LEANING = 3.0  # times what normals of the deviation that was told would be off by in the median
 _FEWEST_POINTS = 30
 _SMALL, _NEARLY_ALL = 0.1, 95.0  # turn (radians) or stretch that a linear law holds for; per cent of the cells
 
@@ -116,6 +117,7 @@ def judge(problem: Problem, found: Found, state: State, expected: Expectations) 
         *_of_the_pose(problem, found, expected),
         *_of_the_conditions(problem, found, expected),
         *_of_the_marks(problem, found),
+        *_of_the_normals(problem, found),
     ]
     if not findings:
         return Judgement(Verdict.ACCEPTED)
@@ -200,6 +202,22 @@ def shared(feet: Floats, distances: Floats, weights: Floats) -> float:
     _, near = cKDTree(points).query(points[asked], k=count + 1)
     beside = values[near[:, 1:]].mean(axis=1)
     return float(np.clip((values[asked] * beside).mean() / (values**2).mean(), 0.0, 1.0))
+
+
+def _of_the_normals(problem: Problem, found: Found) -> list[_Finding]:
+    """Normals that are none of this surface's: of another frame, say, or columns of something else."""
+    if problem.across is None:
+        return []
+    known = np.abs(problem.across).max(axis=(1, 2)) > 0.0
+    leaning = np.linalg.norm(problem.normal_residuals(found.trial).reshape(-1, 2)[known], axis=1) * problem.leaning
+    median = float(np.rad2deg(np.arcsin(np.minimum(np.median(leaning), 1.0))))
+    expected = float(np.rad2deg(np.sqrt(2.0 * np.log(2.0)) * problem.leaning))  # Rayleigh's law
+    if median <= _LEANING * expected:
+        return []
+    return [
+        (Verdict.DOUBTFUL, f"the cloud's normals do not match: half of them lean by more than {median:.0f} degrees "
+                           f"from the surface found, where {expected:.0f} were expected")
+    ]  # fmt: skip
 
 
 def _of_the_state(problem: Problem, state: State, expected: Expectations) -> list[_Finding]:
