@@ -3,9 +3,11 @@
     python benchmarks/hybrid_newton.py [--bodies small large liver] [--seconds 300] [--only ours]
 
 Half of the loads are drawn like those that were learned (and are none of them), half are up to twice as large. A
-failure counts at the time it took. Every state found is compared with the one that 20 load steps lead to from rest.
-All ways solve each load in turn. What is finished is written; the same command goes on. Data and networks are made
-under benchmarks/runs/ where they are not there.
+failure counts at the time it took. Every state found is compared with the one that 20 load steps lead to from rest,
+each from the displacement before and with nothing else to fall back on; negative pivots of its tangent are counted
+afterwards. Softtwin's own ways may take as many load steps as a configuration allows by default. All ways but the load
+steps, which come first, solve each load in turn. What is finished is written; the same command goes on. Data and
+networks are made under benchmarks/runs/ where they are not there.
 """
 
 from __future__ import annotations
@@ -25,9 +27,10 @@ from networks import data_of as small_data
 from networks_bodies import case
 from networks_bodies import data_of as body_data
 from numpy.typing import NDArray
-from record import recorded, write
+from record import recorded, stamp, write
 from threadpoolctl import threadpool_limits
 
+from softtwin.app.config import SolverSection
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.derivatives.model import ReferenceModel
@@ -43,7 +46,7 @@ from softtwin.surrogate.twin import save
 Floats = NDArray[np.float64]
 NAME = "hybrid_newton"
 COUNTS = {"small": 1000, "large": 100, "liver": 100}
-CASES = {"large": "beam", "liver": "liver-tetrahedra"}  # of networks_bodies.py
+CASES = {"large": "beam-few", "liver": "liver-tetrahedra"}  # of networks_bodies.py
 FRESH = 1_000_000  # numbers of loads begin here: none of them is in a data set
 RANGES = ("in range", "up to twice")
 STEPS, MOST = 20, 60
@@ -140,15 +143,15 @@ def stepped_way(problem: Problem) -> Way:
     """As many equal load steps, each from the one before: the state that every other way is held against."""
 
     def solve(load: Floats) -> Found:
-        began, state, iterations, factorisations = time.perf_counter(), None, 0, 0
+        began, reached, iterations, factorisations = time.perf_counter(), np.zeros_like(load), 0, 0
         try:
             for part in np.linspace(0.0, 1.0, STEPS + 1)[1:]:
-                state = problem.solve(part * load, state, stability=False)
+                state = problem.solve(part * load, reached, stability=False, fallback=False)
                 iterations, factorisations = iterations + state.iterations, factorisations + state.factorisations
+                reached = state.displacement
         except NotConverged:
             return Found(None, time.perf_counter() - began, iterations, factorisations)
-        assert state is not None
-        return Found(state.displacement, time.perf_counter() - began, iterations, factorisations)
+        return Found(reached, time.perf_counter() - began, iterations, factorisations)
 
     return solve
 
@@ -189,14 +192,19 @@ def loads_of(data: DataSet, plan: Plan, count: int) -> dict[str, Floats]:
     return {name: part * size[:, None, None] for name, part, size in zip(RANGES, parts, sizes, strict=True)}
 
 
-def figures_of(found: list[Found], truth: list[Floats | None]) -> dict[str, Any]:
-    """Of one way over the loads of one range; means are over all loads, failures at the time they took."""
+def figures_of(problem: Problem, found: list[Found], truth: list[Floats | None]) -> dict[str, Any]:
+    """Of one way over the loads of one range; times are of all loads, failures at the time they took.
+
+    Iterations and factorisations are means over the loads that were solved.
+    """
     milliseconds = 1e3 * np.array([each.seconds for each in found])
     converged = [each for each in found if each.displacement is not None]
     compared = [(a.displacement, b) for a, b in zip(found, truth, strict=True) if b is not None]
     same = sum(a is not None and bool(np.abs(a - b).max() <= SAME * np.abs(b).max()) for a, b in compared)
     alone = sum(a.displacement is not None and b is None for a, b in zip(found, truth, strict=True))
+    pivots = [problem.negative_pivots(each.displacement) for each in converged]
     return {
+        "unstable": sum(bool(count) for count in pivots),
         "loads": len(found),
         "converged": len(converged),
         "same_state": same,
@@ -213,7 +221,8 @@ def figures_of(found: list[Found], truth: list[Floats | None]) -> dict[str, Any]
 
 def truth_of(body: str, problem: Problem, loads: dict[str, Floats]) -> tuple[dict[str, list[Any]], Any]:
     """States that load steps lead to, kept from run to run, and the figures of that way."""
-    path = RUNS / f"hybrid-{body}-truth-{sum(map(len, loads.values()))}.npz"
+    limit = f"{problem.options.tolerance:g}-{problem.options.max_iterations}"  # what a careful step may take
+    path = RUNS / f"hybrid-{body}-truth-{sum(map(len, loads.values()))}-{limit}.npz"
     kept = path.with_suffix(".json")
     if not kept.exists():
         solve, states, figures = stepped_way(problem), {}, {}
@@ -221,7 +230,7 @@ def truth_of(body: str, problem: Problem, loads: dict[str, Floats]) -> tuple[dic
             found = [solve(load) for load in part]
             empty = np.full_like(part[0], np.nan)
             states[name] = np.stack([empty if each.displacement is None else each.displacement for each in found])
-            figures[name] = figures_of(found, [each.displacement for each in found])
+            figures[name] = figures_of(problem, found, [each.displacement for each in found])
         np.savez(path, **states)
         kept.write_text(json.dumps(figures))
     with np.load(path) as stored:
@@ -244,7 +253,8 @@ def main() -> None:
         plan = plan_from_header(data.header)
         network = network_of(body, data, arguments.seconds)
         loads = loads_of(data, plan, arguments.count or COUNTS[body])
-        with threadpool_limits(1), Problem(data.body, plan.build_material(), plan.newton) as problem:
+        patient = replace(plan.newton, max_load_steps=SolverSection().max_load_steps)
+        with threadpool_limits(1), Problem(data.body, plan.build_material(), patient) as problem:
             truth, stepped = truth_of(body, problem, loads)
             ways = {
                 "full steps from rest (algorithm 4)": printed_way(problem, None),
@@ -265,7 +275,8 @@ def main() -> None:
                 ]
                 for label in wanted:
                     key = f"{body}, {name}: {label}"
-                    found[key] = figures_of([each[label] for each in taken], truth[name])
+                    of_way = figures_of(problem, [each[label] for each in taken], truth[name])
+                    found[key] = {**of_way, "made": stamp(), "training_seconds": arguments.seconds}
                     print(key, found[key], flush=True)
                 write(arguments.name, found)
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from record import recorded, write
+from record import recorded, stamp, write
 
 from softtwin.app.chain import prepare
 from softtwin.app.config import Config
@@ -246,9 +246,31 @@ def run(row: Row, data: dict[str, DataSet], problem: Problem | None, learned: Da
     figures: dict[str, Any] = {"plan": None if row.plan is None else row.plan.entries(), "learned_from": row.kind}
     figures |= {"training": surrogate.card.get("training"), "samples": surrogate.card.get("samples"), "wall_s": seconds}
     figures["weights"] = sum(weights.numel() for weights in surrogate.network.parameters())
+    figures |= {"draws": draws_of(row, own), "made": stamp()}
     for kind, each in data.items():
         figures[kind] = judged(surrogate, each, problem, with_jacobian=kind == row.kind)
     return figures
+
+
+def draws_of(row: Row, data: DataSet) -> int:
+    """How many draws a row learns from, those that were rejected with them."""
+    few = row.samples if row.plan is None else row.plan.samples
+    every = int(data.header["plan"]["samples"]["train"])
+    return every if few is None else min(few, every)
+
+
+def is_made(key: str, found: dict[str, Any], draws: int) -> bool:
+    """Whether a record holds a row that learned from so many draws; one from another number is said, and made anew."""
+    if key not in found:
+        return False
+    learned, known = found[key].get("draws"), found[key].get("samples")
+    if learned is None and known is not None:  # rows of before have what was left of them
+        least = known["train"]
+        learned = min(max(draws, least), least + sum(known["rejected"].values()))
+    if learned is None or learned == draws:
+        return True
+    print(f"{key}: learned from {learned} draws, {draws} are asked for: made anew", flush=True)
+    return False
 
 
 def show(key: str, figures: dict[str, Any]) -> None:
@@ -308,7 +330,7 @@ def main(given: Sequence[str] | None = None) -> None:
             if arguments.only not in row.key:
                 continue
             key = f"{row.key}, data {seed}" if seed else row.key
-            if key not in found:
+            if not is_made(key, found, draws_of(row, data[row.kind])):
                 learned = data_of("modal", counts, ranks, seed, True) if row.jacobians else None
                 found[key] = run(row, data, problem, learned)
                 write(arguments.name, found)

@@ -58,6 +58,13 @@ def commit() -> str:
     return told.stdout.strip() or "not known"
 
 
+def stamp() -> dict[str, str]:
+    """What one row of a record carries where rows are made at several times: command, commit, day, processor, GPU."""
+    told = machine()
+    day = time.strftime("%Y-%m-%d")
+    return {"command": command(), "commit": commit(), "date": day, "on": told["processor"], "gpu": told["gpu"]}
+
+
 def _gpu() -> str:
     try:
         import torch

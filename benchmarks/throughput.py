@@ -49,7 +49,7 @@ NETWORK = RUNS / "throughput-network"
 def trained(ranks: int, seconds: float) -> None:
     """The network that solves may start from; what is there is not made again."""
     if not (NETWORK / CARD).exists():
-        save(train(data_of("liver", ranks), TrainingPlan(Reduced(), seconds=seconds)), NETWORK)
+        save(train(data_of("liver", ranks), TrainingPlan(Reduced(), seconds=seconds, samples=1024)), NETWORK)
 
 
 @cache
