@@ -107,7 +107,7 @@ class GaussNewton:
 
     losses: tuple[Loss, ...] = (Huber(), Tukey())
     max_iterations: int = 40
-    settled: float = 0.2
+    settled: float = 0.1
     enough: float = 0.2
     handed_on: float = 1.0
     graduation: float = 1.0
@@ -127,14 +127,6 @@ class GaussNewton:
         """The same with the first loss alone, ended early: for a start."""
         few = min(self.max_iterations, _ROUGH)
         return replace(self, losses=self.losses[:1], settled=self.handed_on, max_iterations=few)
-
-    def settling(self, part: float) -> GaussNewton:
-        """The same, ended by steps of this part of the length: the last of many may be short and leave far to go.
-
-        Args:
-            part: of what is settled.
-        """
-        return replace(self, settled=part * self.settled)
 
     def last(self) -> GaussNewton:
         """The same with the last loss alone: from where all have been."""

@@ -55,14 +55,6 @@ class LBFGS:
         """The same with the first loss alone: for a start."""
         return replace(self, losses=self.losses[:1])
 
-    def settling(self, part: float) -> LBFGS:
-        """The same with a tolerance of this part.
-
-        Args:
-            part: of the tolerance.
-        """
-        return replace(self, tolerance=part * self.tolerance)
-
     def last(self) -> LBFGS:
         """The same with the last loss alone: from where all have been."""
         return replace(self, losses=self.losses[-1:])

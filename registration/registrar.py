@@ -39,7 +39,6 @@ Floats = NDArray[np.float64]
 # few nodes makes it many times what was expected.
 _SPREAD = 0.5
 _SPREAD_ANYWHERE = 0.7  # where a cloud tells the size of forces of which most are none
-_THOROUGH = 0.25  # with less, what is left of an exact model's descent is a part of its doubt
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
@@ -101,7 +100,6 @@ class RegistrationOptions:
         most_points: larger clouds are thinned to so many points.
         gathering: how a cold start finds where forces act.
         belief: when the size of the forces is left to the cloud.
-        thorough: part of what the solver calls settled that a cold start has to reach.
         distance: of points to the surface, or to the planes of its triangles; see `SurfaceDistance`.
         normal_deviation: standard deviation of a measured normal across itself, radians.
     """
@@ -111,7 +109,6 @@ class RegistrationOptions:
     most_points: int = 1000
     gathering: Gathering = field(default_factory=Gathering)
     belief: Belief = field(default_factory=Belief)
-    thorough: float = 1.0
     distance: Distance = "surface"
     normal_deviation: float = NORMAL_DEVIATION
 
@@ -124,8 +121,6 @@ class RegistrationOptions:
             )
         if self.most_points < 1:
             raise ValueError(f"RegistrationOptions.most_points: expected at least 1, got {self.most_points}.")
-        if not 0.0 < self.thorough <= 1.0:
-            raise ValueError(f"RegistrationOptions.thorough: expected a part above 0 and up to 1, got {self.thorough}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +317,6 @@ class Registrar:
         self.noise = self.options.noise.at_least(model.error)
         self.expectations = expectations or Expectations.of(model, self.noise)
         self._everywhere = self._prepared(forces)
-        self._thorough = self.options.solver.settling(self.options.thorough)
 
     def _prepared(self, forces: Forces) -> Prepared:
         return Prepared.of(self.model, self.observed, forces, self.conditions)
@@ -345,7 +339,6 @@ class Registrar:
         """The same, which begins no step after a time of the monotonic clock, seconds, and gives the best so far."""
         other = copy.copy(self)
         other.options = replace(self.options, solver=replace(self.options.solver, until=until))
-        other._thorough = replace(self._thorough, until=until)
         return other
 
     def marked(self, marks: Marks | None) -> Registrar:
@@ -399,7 +392,7 @@ class Registrar:
         problem = self._problem(points, start.prepared, start.trial, start.doubt)
         near = problem.begun(start.trial.coefficients.copy(), start.trial)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
-            found = self._from_rest(points, start.prepared, self._thorough)
+            found = self._from_rest(points, start.prepared, self.options.solver)
             result = self._finished(points, start.prepared, found, begin)
         else:
             solver = self.options.solver.following()
@@ -422,7 +415,7 @@ class Registrar:
             NotConverged: the model found no state there.
         """
         begin = time.perf_counter()
-        points, solver = self._checked(cloud), self._thorough.following()
+        points, solver = self._checked(cloud), self.options.solver.following()
         forces = replace(draft.prepared.forces, scale=self.forces.scale)
         prepared = self._prepared(forces)
         problem = self._plain(points, prepared)
@@ -478,7 +471,7 @@ class Registrar:
 
     def _cold(self, points: Cloud, begin: float) -> Registration:
         """From rest; where the place of the forces is unknown, once more for each round of gathering them."""
-        prepared, gathering, solver = self._everywhere, self.options.gathering, self._thorough
+        prepared, gathering, solver = self._everywhere, self.options.gathering, self.options.solver
         few, is_gathered = points.thinned(gathering.points), gathering.rounds > 0
         begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
         found = self._from_rest(*begun)
@@ -506,7 +499,7 @@ class Registrar:
         self, points: Cloud, prepared: Prepared, found: Found, begin: float, is_settled: bool = True
     ) -> Registration:
         """With all points, and with the model's error in patterns, from a result that took it for noise."""
-        solver, doubt, is_hopeless = self._thorough, 1.0, self._is_hopeless(found)
+        solver, doubt, is_hopeless = self.options.solver, 1.0, self._is_hopeless(found)
         if is_hopeless:
             solver = solver.without_steps()
         believed = prepared if self.error is not None else self._believed(prepared, found)
@@ -717,7 +710,7 @@ def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> 
     clear, loud = _CLEAR * NOISE.least, _LOUD * model.error
     if model.error == 0.0:
         gathering = Gathering(rounds=0 if has_zone else Gathering.rounds, points=_MANY)
-        return RegistrationOptions(gathering=gathering, belief=Belief(clear), thorough=_THOROUGH)
+        return RegistrationOptions(gathering=gathering, belief=Belief(clear))
     if has_zone:
         return RegistrationOptions(belief=Belief(clear if has_pose else 0.0, loud))
     return RegistrationOptions(gathering=Gathering(reach=_CLOSE), belief=Belief(loud=loud, spread=_SPREAD_ANYWHERE))
