@@ -132,7 +132,7 @@ def _generate(space: Workspace, body: Body, path: Path, say: Say, again: bool) -
 
 
 def _doubt(space: Workspace, path: Path, say: Say) -> None:
-    if not space.config.doubt.draws or not (space.config.doubt.attachment or space.config.doubt.poisson_ratio):
+    if not space.config.doubt.is_asked_for:
         (space.twin / DOUBT).unlink(missing_ok=True)
         say("    nothing: [doubt] names none, and margins know of none")
     elif is_current(space, DataSet(space.data)):

@@ -210,7 +210,15 @@ class DoubtSection(_Section):
     poisson_ratio: tuple[float, float] | tuple[()] = Field(
         (), description="least and largest Poisson's ratio that the organ may have; empty: the material's"
     )
+    meshes: int = Field(
+        0, ge=0, description="other meshes of the organ's surface, of half to twice as many nodes; 0: the twin's own"
+    )
     seed: int = Field(0, ge=0, description="seed of the draws")
+
+    @property
+    def is_asked_for(self) -> bool:
+        """Whether anything may be otherwise, and is drawn."""
+        return bool(self.draws and (self.attachment or self.poisson_ratio or self.meshes))
 
 
 class RegistrationSection(_Section):

@@ -92,6 +92,8 @@ def _otherwise(asked: Mapping[str, Any]) -> str:
     if asked.get("poisson_ratio"):
         least, largest = asked["poisson_ratio"]
         words.append(f"a Poisson's ratio of {least:g} to {largest:g}")
+    if asked.get("meshes"):
+        words.append(f"{asked['meshes']} other meshes of its surface")
     return " and ".join(words)
 
 

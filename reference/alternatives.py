@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.embedding import Embedding, embed
+from softtwin.meshes.files import read_body, write_body
+from softtwin.meshes.solidify import solidify
 
 from .data.dataset import DataSet, Samples
 from .data.outcome import NotConverged
@@ -34,6 +37,7 @@ Ints = NDArray[np.int64]
 _LEAST_HELD = 3  # nodes: on fewer the body may turn
 _TOO_FAR = 3.0  # times the largest displacement of the model's own state: another branch, or nothing holds the organ
 _BLOCK = 4  # draws that are solved and written together
+_FINENESS, _FEWEST_NODES = 2.0, 60  # nodes of the finest other mesh, over the model's; of the coarsest
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,8 @@ class Alternatives:
         attachment: what holds the organ lies elsewhere on its surface: standard deviation of each coordinate of the
             shift, metres; 0 for as the model has it.
         poisson_ratio: least and largest, all alike; None for the model's.
+        meshes: other meshes of the same surface, of half as many to twice as many nodes; one of them is drawn for each
+            alternative. 0 for the model's own.
 
     Raises:
         ValueError: an argument out of its range, or nothing that may be otherwise.
@@ -51,6 +57,7 @@ class Alternatives:
 
     attachment: float = 0.0
     poisson_ratio: tuple[float, float] | None = None
+    meshes: int = 0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.attachment < np.inf:
@@ -58,7 +65,9 @@ class Alternatives:
         ratio = self.poisson_ratio
         if ratio is not None and not 0.0 <= ratio[0] <= ratio[1] < 0.5:
             raise ValueError(f"Alternatives.poisson_ratio: expected 0 <= least <= largest < 0.5, got {ratio}.")
-        if self.attachment == 0.0 and ratio is None:
+        if self.meshes < 0:
+            raise ValueError(f"Alternatives.meshes: expected 0 or more, got {self.meshes}.")
+        if self.attachment == 0.0 and ratio is None and self.meshes == 0:
             raise ValueError("Alternatives: expected something that may be otherwise than in the model, got nothing.")
 
 
@@ -109,10 +118,16 @@ def differences(
                 raise ValueError(f"differences.count: expected at least 1, got {count}.")
             data = DataSet(path)
             data.check_complete("train")
-            if alternatives.attachment:
+            if alternatives.attachment or alternatives.meshes:
                 shifted(data.body, np.zeros(3))
+            if alternatives.meshes and data.body.cells.shape[1] != 4:
+                raise ValueError(
+                    "Alternatives.meshes: expected a body of linear tetrahedra, which are made anew, got cells of "
+                    f"{data.body.cells.shape[1]} nodes."
+                )
             held.enter_context(writing(Path(path)))
             folder = _folder(data, alternatives, seed)
+            _mesh_anew(data.body, alternatives.meshes, folder)
             blocks = [block for block in range(-(-count // _BLOCK)) if not _file(folder, block).exists()]
             return str(path), folder, alternatives, blocks
 
@@ -144,8 +159,9 @@ def difference_block(path: str, block: int, folder: Path, alternatives: Alternat
     """
     data, samples, plan = _opened(path, (Path(path) / "zarr.json").stat().st_mtime_ns)
     draws = range(block * _BLOCK, (block + 1) * _BLOCK)
+    others = tuple(_carried(data, _mesh_file(folder, number)) for number in range(alternatives.meshes))
     with threadpool_limits(1):
-        each = [_difference(data, samples, plan, alternatives, draw, seed) for draw in draws]
+        each = [_difference(data, samples, plan, alternatives, others, draw, seed) for draw in draws]
     missing = np.full(data.body.points.size, np.nan)
     partial_file = folder / f".{block}.partial.npy"
     np.save(partial_file, np.stack([missing if error is None else error for error in each]))
@@ -161,18 +177,32 @@ def _opened(path: str, made: int) -> tuple[DataSet, Samples, Plan]:
 
 
 def _difference(
-    data: DataSet, samples: Samples, plan: Plan, alternatives: Alternatives, draw: int, seed: int
+    data: DataSet,
+    samples: Samples,
+    plan: Plan,
+    alternatives: Alternatives,
+    others: tuple[tuple[Body, Embedding], ...],
+    draw: int,
+    seed: int,
 ) -> Floats | None:
-    """One alternative less the model's state, over its largest displacement, (3n,); None where there is none."""
+    """One alternative less the model's state, over its largest displacement, (3n,); None where there is none.
+
+    Another mesh carries the model's nodes: they hand their forces on to it, and move with it.
+    """
     rng, place = np.random.default_rng([seed, draw]), draw % len(samples)
     body, known = data.body, samples.displacements[place]
     forces = np.zeros_like(body.points)
     forces[data.response.loaded] = samples.forces[place]
-    if alternatives.attachment:
-        held = shifted(body, alternatives.attachment * rng.standard_normal(3))
+    shift = alternatives.attachment * rng.standard_normal(3) if alternatives.attachment else np.zeros(3)
+    carrier = None
+    if others:
+        body, carrier = others[int(rng.integers(len(others)))]
+        forces = np.asarray(carrier.matrix.T @ forces)
+    if alternatives.attachment or carrier is not None:
+        held = shifted(data.body, shift, body)
         if len(held) < _LEAST_HELD:
             return None
-        if alternatives.poisson_ratio is None and np.array_equal(held, body.fixed):
+        if carrier is None and alternatives.poisson_ratio is None and np.array_equal(held, body.fixed):
             return np.zeros(body.points.size)
         body = body.with_sets(fixed=held)
         forces[held] = 0.0
@@ -180,14 +210,15 @@ def _difference(
         plan = replace(plan, poisson_ratio=float(rng.uniform(*alternatives.poisson_ratio)))
     try:
         with Problem(body, plan.build_material(), plan.newton) as problem:
-            off = problem.solve(forces, stability=False).displacement - known
+            found = problem.solve(forces, stability=False).displacement
     except NotConverged:
         return None
+    off = (found if carrier is None else carrier.displace(found)) - known
     size = max(float(np.linalg.norm(known, axis=1).max()), 1e-12)
     return None if np.linalg.norm(off, axis=1).max() > _TOO_FAR * size else np.asarray(off.ravel() / size)
 
 
-def shifted(body: Body, shift: Floats) -> Ints:
+def shifted(body: Body, shift: Floats, other: Body | None = None) -> Ints:
     """The nodes that hold a body, moved along its surface: numbers of the nodes that are held then.
 
     A node of the boundary is held where the one nearest to the place that it would come from is.
@@ -195,6 +226,7 @@ def shifted(body: Body, shift: Floats) -> Ints:
     Args:
         body: with fixed nodes.
         shift: (3,), metres.
+        other: another mesh of the same organ, whose nodes are wanted; the body itself if not given.
 
     Raises:
         ValueError: none is fixed on the boundary.
@@ -203,8 +235,33 @@ def shifted(body: Body, shift: Floats) -> Ints:
     is_held = np.isin(boundary, body.fixed)
     if not is_held.any():
         raise ValueError("shifted.body: expected fixed nodes on the boundary, got none.")
-    nearest = body.boundary_tree.query(body.points[boundary] - shift)[1]
-    return np.asarray(boundary[is_held[nearest]])
+    wanted = body if other is None else other
+    nearest = body.boundary_tree.query(wanted.points[wanted.boundary_nodes] - shift)[1]
+    return np.asarray(wanted.boundary_nodes[is_held[nearest]])
+
+
+def _mesh_anew(body: Body, count: int, folder: Path) -> None:
+    """Write other meshes of a body's surface, of half as many to twice as many nodes; what is there stays."""
+    shares = _FINENESS ** np.linspace(-1.0, 1.0, count) if count > 1 else np.array([1.0])
+    for number, share in enumerate(shares[:count]):
+        if not _mesh_file(folder, number).exists():
+            solid = solidify(body.boundary_surface, node_count=max(int(share * len(body.points)), _FEWEST_NODES))
+            write_body(_mesh_file(folder, number), Body(solid.points, solid.cells, {}))
+
+
+def _mesh_file(folder: Path, number: int) -> Path:
+    return folder / f"mesh_{number}.vtu"
+
+
+@lru_cache(maxsize=8)
+def _carried_as(file: Path, made: int, body: Body) -> tuple[Body, Embedding]:
+    other = read_body(file)
+    return other, embed(other, body.points)
+
+
+def _carried(data: DataSet, file: Path) -> tuple[Body, Embedding]:
+    """Another mesh, and how it carries the model's nodes."""
+    return _carried_as(file, file.stat().st_mtime_ns, data.body)
 
 
 def _folder(data: DataSet, alternatives: Alternatives, seed: int) -> Path:

@@ -77,7 +77,7 @@ def alternatives_of(config: Config) -> Any:
 
     section = config.doubt
     try:
-        return Alternatives(section.attachment, section.poisson_ratio or None)
+        return Alternatives(section.attachment, section.poisson_ratio or None, section.meshes)
     except ValueError as error:
         raise ConfigError(f"doubt: {error}") from None
 

@@ -51,6 +51,31 @@ def test_an_error_is_the_alternative_less_the_model(data: DataSet) -> None:
     assert found.failed == 0 and np.abs(found.errors).max() > 1e-3
 
 
+def test_another_mesh_carries_the_loads_and_the_nodes(data: DataSet) -> None:
+    """Linear tetrahedra of another size move otherwise, but not far; what holds the organ, and the loads, stay."""
+    pytest.importorskip("pytetwild")
+    found = differences(data.path, Alternatives(meshes=2), 6)
+    lengths = np.linalg.norm(found.errors.reshape(len(found.errors), -1, 3), axis=2)
+    assert found.failed <= 2  # of the coarser mesh hardly more than three nodes are held
+    assert len(list((data.path.parent / "doubt").rglob("mesh_*.vtu"))) == 2
+    assert (lengths.max(axis=1) > 1e-3).all()  # no alternative is the model's own mesh
+    assert lengths.mean() < 0.25
+    again = differences(data.path, Alternatives(meshes=2), 6)
+    np.testing.assert_array_equal(again.errors, found.errors)
+    forget(data.path)
+
+
+def test_another_mesh_of_the_same_cells_changes_nothing(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
+    body = data.body
+    same = type("Solid", (), {"points": body.points, "cells": body.cells})
+    monkeypatch.setattr("softtwin.reference.alternatives.solidify", lambda surface, node_count: same)
+    found = differences(data.path, Alternatives(meshes=1), 3)
+    assert (
+        found.failed == 0 and np.abs(found.errors).max() < 1e-5
+    )  # of the largest displacement: the solver's tolerance
+    forget(data.path)
+
+
 def test_draws_are_the_same_however_often_they_were_interrupted(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = Alternatives(attachment=0.02)
     forget(data.path)
