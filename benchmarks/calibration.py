@@ -1,0 +1,208 @@
+"""Is the doubt right where the model is? Truths drawn from the prior, a thousand cases on the beam and on the liver.
+
+    python benchmarks/calibration.py [--bodies beam liver] [--cases 1000] [--twin TWIN]
+
+Nodal forces are drawn from the prior that the registration has (smooth over a zone, their size log-normal about the one
+told), solved by the reference, and seen as a noisy cloud of 500 points of one side; the surrogate registers them from
+rest, told neither noise nor size. Covered is the share of nodes whose error lies within the margin, and of net forces
+within their region (chi-square, three components). z are the net force's errors in the coordinates in which its
+covariance is one: three standard normal numbers a case, if the doubt is right. Ranks are those of the truth in the
+posterior (simulation-based calibration, Talts et al. 2018), here by its normal law: uniform if right. The largest
+distance of their distribution from the uniform one is given with Kolmogorov's 95 % envelope. Refused frames are counted
+and left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from beam_registration import BODY, MODULUS, RATIO, network_of
+from liver import POISSON_RATIO, YOUNG_MODULUS, liver
+from networks import RUNS
+from networks_bodies import data_of
+from numpy.typing import NDArray
+from record import recorded, stamp, write
+from scipy.stats import chi2, norm
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from softtwin.meshes.body import Body, Surface
+from softtwin.meshes.clouds import CloudError, sample
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.solve.problem import Problem
+from softtwin.registration.evidence import Scale
+from softtwin.registration.registrar import options_for, prepare
+from softtwin.registration.unknowns import nodal_forces
+from softtwin.registration.verdict import Verdict
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.twin import load as load_twin
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+NAME = "calibration"
+POINTS, SPREAD = 500, 0.5  # of the logarithm of the forces' size, as the product believes
+SHARES = (0.5, 0.9, 0.95)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A body with its network.
+
+    Args:
+        network: that registers.
+        material: of the reference.
+        zone: nodes that may carry force.
+        observed: the side that is seen, (t, 3).
+        smoothness: correlation length of the forces, metres.
+        noise: of a point, metres.
+        moved: largest displacement under forces of the size told, in the median, metres.
+    """
+
+    network: Surrogate
+    material: NeoHookean
+    zone: Ints
+    observed: Ints
+    smoothness: float
+    noise: float
+    moved: float
+
+
+def beam_case(twin: Path, ranks: int) -> Case:
+    """The thesis's beam of table 6.1, seen from above and the side, pulled on its outer half."""
+    data = data_of(BODY, ranks, jacobians=True)
+    network, body = network_of(data, 200.0), data.body
+    corners = body.points[body.boundary]
+    seen = (corners[:, :, 1:] > 0.2499).all(axis=1).any(axis=1)
+    zone = np.flatnonzero(body.points[:, 0] > 0.5)
+    return Case(network, NeoHookean(MODULUS, RATIO), zone, body.boundary[seen], 0.1, 1e-3, 0.08)
+
+
+def liver_case(twin: Path, ranks: int) -> Case:
+    """The real liver, pulled in the zone of s1."""
+    body = liver()
+    material = NeoHookean(YOUNG_MODULUS, POISSON_RATIO)
+    return Case(load_twin(twin, body), material, body.node_sets["s1"], body.surfaces["observed"], 0.02, 1e-3, 0.02)
+
+
+CASES: dict[str, Callable[[Path, int], Case]] = {"beam": beam_case, "liver": liver_case}
+
+
+def size_told(case: Case, body: Body) -> float:
+    """Newtons for which forces of the prior move the body as far as is wanted, in the median, to first order."""
+    forces = nodal_forces(body, case.zone, Scale(1.0, SPREAD), case.smoothness)
+    rng = np.random.default_rng(1)
+    draws = forces.basis @ rng.standard_normal((forces.size, 50))
+    moved = case.network.solve(np.zeros_like(body.points)).push(draws).reshape(-1, 3, 50)
+    return case.moved / float(np.median(np.linalg.norm(moved, axis=1).max(axis=0)))
+
+
+def run(case: Case, count: int) -> dict[str, Any]:
+    """So many cases; a load without a stable equilibrium, or beyond what the network has learned, is drawn again."""
+    body = case.network.body
+    scale = Scale(size_told(case, body), SPREAD, least=1e-6)
+    drawn = nodal_forces(body, case.zone, scale, case.smoothness)
+    registrar = prepare(
+        case.network,
+        case.zone,
+        case.observed,
+        force_scale=scale.median,
+        smoothness=case.smoothness,
+        options=options_for(case.network, has_zone=True),
+    )
+    rows, again = [], {"no stable equilibrium": 0, "beyond what was learned": 0}
+    with Problem(body, case.material) as problem, tqdm(total=count, desc="cases") as bar:
+        number = 0
+        while len(rows) < count:
+            rng = np.random.default_rng([11, number])
+            number += 1
+            size = scale.median * np.exp(SPREAD * rng.standard_normal())
+            forces = drawn.forces(size * rng.standard_normal(drawn.size))
+            if (case.network.solve(forces).extent or 0.0) > 1.0:
+                again["beyond what was learned"] += 1
+                continue
+            try:
+                state = problem.solve(forces)
+            except NotConverged:
+                state = None
+            if state is None or not state.is_stable:
+                again["no stable equilibrium"] += 1
+                continue
+            rows.append(one(case, registrar, forces, state.displacement, rng))
+            bar.update()
+    return {**summary(rows), "drawn_again": again, "force_scale_N": scale.median}
+
+
+def one(case: Case, registrar: Any, forces: Floats, truth: Floats, rng: np.random.Generator) -> dict[str, Any]:
+    """Errors and doubt of one registration."""
+    body = case.network.body
+    cloud = sample(Surface(body.points + truth, case.observed), POINTS, rng)
+    try:
+        result = registrar.register(cloud + case.noise * rng.standard_normal(cloud.shape))
+    except (CloudError, NotConverged) as error:
+        return {"verdict": Verdict.REFUSED.value, "failure": str(error)}
+    known, missed = result.uncertainty, result.net_force - forces.sum(axis=0)
+    errors = np.linalg.norm(result.displacement - truth, axis=1)
+    free = np.setdiff1d(np.arange(len(errors)), body.fixed)
+    root = np.linalg.cholesky(result.net_force_covariance)
+    return {
+        "verdict": result.judgement.verdict.value,
+        "error_mm": 1e3 * float(errors.mean()),
+        "predicted_mm": 1e3 * float(np.sqrt(8.0 / (3.0 * np.pi)) * known.deviation.mean()),
+        "covered": [float((errors <= known.margin(None, share))[free].mean()) for share in SHARES],
+        "z": np.linalg.solve(root, missed).tolist(),
+        "ranks": norm.cdf(-missed / result.net_force_deviation).tolist(),
+        "seconds": result.seconds,
+    }
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Over the cases that were not refused."""
+    used = [row for row in rows if row["verdict"] != Verdict.REFUSED.value]
+    z = np.array([row["z"] for row in used])
+    squares, ranks = (z**2).sum(axis=1), np.sort([row["ranks"] for row in used], axis=0)
+    errors, predicted = (np.array([row[name] for row in used]) for name in ("error_mm", "predicted_mm"))
+    steps = np.arange(1, len(used) + 1) / len(used)
+    apart = np.maximum(steps[:, None] - ranks, ranks - steps[:, None] + 1.0 / len(used)).max(axis=0)
+    verdicts = [row["verdict"] for row in rows]
+    return {
+        "cases": len(rows),
+        "verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))},
+        "error_mm": float(errors.mean()),
+        "predicted_mm": float(predicted.mean()),
+        "correlation": float(np.corrcoef(errors, predicted)[0, 1]),
+        "off_mm": float(np.abs(errors - predicted).mean()),
+        "nodes": dict(zip(map(str, SHARES), np.mean([row["covered"] for row in used], axis=0).tolist(), strict=True)),
+        "force": {str(share): float(np.mean(squares <= chi2.ppf(share, 3))) for share in SHARES},
+        "z_mean": z.mean(axis=0).tolist(),
+        "z_deviation": z.std(axis=0).tolist(),
+        "ranks_apart": apart.tolist(),
+        "envelope": 1.358 / np.sqrt(len(used)),  # Kolmogorov's, 95 %
+        "median_seconds": float(np.median([row["seconds"] for row in used])),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--bodies", nargs="+", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--cases", type=int, default=1000)
+    parser.add_argument("--twin", type=Path, default=RUNS / "liver" / "twin")
+    parser.add_argument("--ranks", type=int, default=2)
+    parser.add_argument("--name", default=NAME, help="of the record")
+    arguments = parser.parse_args()
+    found = recorded(arguments.name)
+    for body in arguments.bodies:
+        if body not in found:
+            with threadpool_limits(1):
+                found[body] = {**run(CASES[body](arguments.twin, arguments.ranks), arguments.cases), "made": stamp()}
+            write(arguments.name, found)
+        print(body, found[body], flush=True)
+
+
+if __name__ == "__main__":
+    main()
