@@ -5,9 +5,9 @@
 One frame of the real liver. As in the thesis the body at rest is turned about the origin of its coordinates by a
 rotation vector and shifted, each component normal with deviation s (rad, metres), every point of the cloud is moved by
 normal noise of the same s (metres), and the forces have to take up what the pose is wrong by; in the other rows the
-pose is an unknown. Each draw starts from the result for the clean cloud, as a frame of a sequence would. The thesis perturbs by
-s = 1e-4 to 1e-3, a thousand draws a level, and prints its errors at both ends: 6.4e-6 to 7.5e-6 (most likely the mean
-square, m^2: 2.5 to 2.7 mm) and 28.0 +- 0.8 to 32.2 +- 7.7 % of the net force.
+pose is an unknown. Each draw starts from the result for the clean cloud, as a frame of a sequence would. The thesis
+perturbs by s = 1e-4 to 1e-3, a thousand draws a level, and prints its errors at both ends: 6.4e-6 to 7.5e-6 (most
+likely the mean square, m^2: 2.5 to 2.7 mm) and 28.0 +- 0.8 to 32.2 +- 7.7 % of the net force.
 """
 
 from __future__ import annotations
