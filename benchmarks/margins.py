@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from record import recorded, write
+from record import recorded, stamp, write
 from threadpoolctl import threadpool_limits
 
 from softtwin.app.quickstart import CAMERA, POINTS
@@ -73,6 +73,16 @@ def one(twin: Twin, truth: Floats, noise: float, seed: int) -> dict[str, Any]:
         "predicted_mm": 1e3 * float(np.sqrt(8.0 / (3.0 * np.pi)) * known.deviation.mean()),  # mean of a normal's length
         "covered": {share: float((lengths <= known.margin(None, share) + 1e-12).mean()) for share in SHARES},
     }
+    bound = twin.bounded(result)
+    if result.draft is not None and bound is not None:  # where both engines part, and whether the network had said so
+        apart = np.linalg.norm(result.draft.displacement - result.displacement, axis=1)
+        kept["draft"] = {
+            "apart_mm": 1e3 * float(apart.mean()),
+            "largest_mm": 1e3 * float(apart.max()),
+            "bound_mm": 1e3 * bound.mean,
+            "within_bound": bool(apart.mean() <= bound.mean),
+            "inside": bound.is_inside,
+        }
     for name, points in twin.embeddings.items():
         away = np.linalg.norm(points.displace(missed), axis=1)
         kept["structures"][name] = {
@@ -101,6 +111,12 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "median_seconds": float(np.median([row["seconds"] for row in used])),
         "structures": {},
     }
+    drafts = [row["draft"] for row in used if "draft" in row]
+    if drafts:
+        found["drafts"] = {
+            name: float(np.mean([draft[name] for draft in drafts]))
+            for name in ("apart_mm", "largest_mm", "within_bound", "inside")
+        } | {"bound_mm": float(np.median([draft["bound_mm"] for draft in drafts])), "count": len(drafts)}
     for name in used[0]["structures"]:
         each = [row["structures"][name] for row in used]
         found["structures"][name] = {
@@ -128,7 +144,7 @@ def main() -> None:
             if key not in found:
                 with threadpool_limits(1), Twin.open(arguments.folder, engine) as twin:
                     rows = [one(twin, truth, noise, i) for i, truth in enumerate(states)]
-                found[key] = {"summary": summary(rows)}
+                found[key] = {"summary": summary(rows), "made": stamp()}
                 write(arguments.name, found)
             told = {name: value for name, value in found[key]["summary"].items() if name != "structures"}
             print(key, json.dumps(told), json.dumps(found[key]["summary"]["structures"]), sep="\n  ", flush=True)

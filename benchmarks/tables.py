@@ -189,6 +189,7 @@ def hybrid() -> None:
     head(
         "hybrid_newton",
         "same state",
+        "converged; unstable",
         "prediction picked",
         "where solved: iterations; factorisations",
         "ms: median; mean; 95 %",
@@ -196,7 +197,8 @@ def hybrid() -> None:
     for key, f in found.items():
         row(
             key,
-            f"{f['same_state']} of {f['loads']}",
+            f"{f['same_state']} of {f['compared']}",
+            f"{f['converged']} of {f['loads']}; {f['unstable']}",
             f"{100 * f['picked'] / f['loads']:.0f} %",
             f"{f['iterations']:.1f}; {f['factorisations']:.2f}",
             f"{f['median_ms']:.1f}; {f['mean_ms']:.1f}; {f['p95_ms']:.0f}",
@@ -305,6 +307,91 @@ def beam_registration() -> None:
                 f"{100 * f['matched']:.1f}; {100 * f['matched_in_a_wrong_state']:.1f}",
                 ", ".join(f"{count} {verdict}" for verdict, count in f["verdicts"].items()) or "-",
             )
+
+
+def shares(covered: dict[str, float]) -> str:
+    """Per cent, in their order."""
+    return " / ".join(f"{100 * share:.0f}" for share in covered.values())
+
+
+def liver_engines() -> None:
+    """The real liver by engine, on another mesh, with a wrong organ."""
+    found = recorded("liver_engines")
+    if not found:
+        return
+    head(
+        "liver_engines",
+        "frames: accepted; doubtful; refused",
+        "TRE mm: s1; s2; s3 (worst)",
+        "predicted",
+        "force %",
+        "nodes covered by 50 / 90 / 95 % margins",
+        "net force",
+        "median s (longest); cold",
+    )
+    for key, f in found.items():
+        told = f["summary"]
+        counts = "; ".join(str(told["verdicts"].get(name, 0)) for name in ("accepted", "doubtful", "refused"))
+        tre = "; ".join(f"{value:.3f}" for value in told["tre_mm"].values())
+        row(
+            key,
+            f"{told['frames']}: {counts}" + (f", {told['failed']} failed" if told["failed"] else ""),
+            f"{tre} ({told['worst_tre_mm']:.2f})",
+            f"{told['predicted_mm']:.3f}",
+            f"{100 * told['force_error']:.1f}",
+            shares(told["covered"]),
+            shares(told["force_covered"]),
+            f"{told['median_seconds']:.3f} ({told['longest_seconds']:.2f}); "
+            + " / ".join(f"{seconds:.2f}" for seconds in told["cold"]["seconds"]),
+        )
+
+
+def pose_noise() -> None:
+    """Noise of pose and cloud, level by level."""
+    found = recorded("pose_noise")
+    if not found:
+        return
+    errors = ("TRE mm", "mean square, 1e-6 m^2", "force %")
+    head("pose_noise", "draws; failed", *errors, "z rms", "accepted %", "median s")
+    for key, f in found.items():
+        row(
+            key,
+            f"{f['draws']}; {f['failed']}",
+            f"{f['tre_mm']['mean']:.2f} +- {f['tre_mm']['deviation']:.2f}",
+            f"{1e6 * f['mean_square_m2']['mean']:.2f} +- {1e6 * f['mean_square_m2']['deviation']:.2f}",
+            f"{100 * f['force_error']['mean']:.1f} +- {100 * f['force_error']['deviation']:.1f}",
+            f"{f['z_rms']:.2f}",
+            f"{100 * f['verdicts'].get('accepted', 0) / f['draws']:.0f}",
+            f"{f['median_seconds']:.3f}",
+        )
+
+
+def calibration() -> None:
+    """Doubt against truths drawn from the prior."""
+    found = recorded("calibration")
+    if not found:
+        return
+    head(
+        "calibration",
+        "accepted; doubtful; refused",
+        "error; predicted mm; r",
+        "nodes covered by 50 / 90 / 95 % margins",
+        "net force",
+        "z: mean; deviation",
+        "ranks apart; envelope",
+        "median s",
+    )
+    for key, f in found.items():
+        row(
+            key,
+            "; ".join(str(f["verdicts"].get(name, 0)) for name in ("accepted", "doubtful", "refused")),
+            f"{f['error_mm']:.2f}; {f['predicted_mm']:.2f}; {f['correlation']:.2f}",
+            shares(f["nodes"]),
+            shares(f["force"]),
+            f"{', '.join(f'{z:.2f}' for z in f['z_mean'])}; {', '.join(f'{z:.2f}' for z in f['z_deviation'])}",
+            f"{', '.join(f'{apart:.3f}' for apart in f['ranks_apart'])}; {f['envelope']:.3f}",
+            f"{f['median_seconds']:.2f}",
+        )
 
 
 def penalties() -> None:
@@ -471,6 +558,9 @@ def print_all() -> None:
     certificates()
     checked_network()
     beam_registration()
+    liver_engines()
+    pose_noise()
+    calibration()
     penalties()
     margins()
     active_rounds()
