@@ -98,7 +98,7 @@ class GaussNewton:
             settled: closest points jump from triangle to triangle, and no objective falls for ever.
         handed_on: the same for all losses but the last.
         graduation: the noise is taken as at least this part of what the linear model promises to change.
-        max_step: first limit on the movement of any observed node in one step, metres.
+        max_step: first limit on the movement of any observed node in one step, part of the body's size.
         least_step: no step that moves all observed nodes less than this is tried, metres.
         trusted: before the end closest points are searched anew, of points further from the surface than so many of
             their deviations; 0 for all.
@@ -111,7 +111,7 @@ class GaussNewton:
     enough: float = 0.2
     handed_on: float = 1.0
     graduation: float = 1.0
-    max_step: float = 16e-3
+    max_step: float = 0.05
     least_step: float = 1e-6
     trusted: float = 0.0
     until: float = np.inf
@@ -164,10 +164,14 @@ class _Search:
     def __init__(self, options: GaussNewton, problem: Problem, start: Floats, near: Trial | None) -> None:
         self.options, self.problem = options, problem
         self.trial = _begun(problem, start, near)
-        self.evaluations, self.limit = 1, options.max_step
+        self.evaluations, self.limit = 1, self._first_limit
         self.noise, self.own = max(robust_deviation(self.trial.match.distances), problem.noise.least), 0.0
         self.trace: list[Step] = []
         self._at: LocalModel | None = None
+
+    @property
+    def _first_limit(self) -> float:
+        return self.options.max_step * self.problem.observed.body.size
 
     def run(self) -> Found:
         options = self.options
@@ -250,7 +254,7 @@ class _Search:
                     Step(trial.match.rms, value, local.noise, local.scales.force, largest, local.length, gain)
                 )
                 return None
-        self.limit = self.options.max_step
+        self.limit = self._first_limit
         return Outcome.REFUSED if unsolved else Outcome.NO_DESCENT
 
 
