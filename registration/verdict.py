@@ -23,8 +23,8 @@ _ASKED = 250  # points at least, whose neighbours are looked at
 _MARK_OFF = 4.0  # deviations of a landmark's place; three axes together are beyond it once in a thousand
 _LEANING = 3.0  # times what normals of the deviation that was told would be off by in the median
 _FEWEST_POINTS = 30
-# Turn (radians) or stretch that a linear law holds for, half of which it is off by, relative: a centimetre of movement is
-# then good to a camera's noise. Per cent of the cells.
+# Turn (radians) or stretch that a linear law holds for, half of which it is off by, relative: a centimetre of movement
+# is then good to a camera's noise. Per cent of the cells.
 _SMALL, _NEARLY_ALL = 0.03, 95.0
 
 
