@@ -18,7 +18,7 @@ from scipy.optimize import linprog
 from scipy.stats import spearmanr
 
 from softtwin.meshes.metrics import nodal_distances
-from softtwin.reference.data.dataset import DataSet, Samples, Split, stored_plan
+from softtwin.reference.data.dataset import DataSet, Samples, Split, stored_plans
 
 from .certificate import ERRORS, Certifier
 from .model import Surrogate
@@ -76,7 +76,7 @@ def calibrate(
     if wrong:
         raise CalibrationError(f"calibrate.data: {data.path} is of another material than the surrogate: {wrong[0]}.")
     held, fitted = data.samples(split), data.samples(fitted_on)
-    paths = _paths(data, held)
+    paths = data.load_paths(split, held.draws)
     if len(np.unique(paths)) < needed(confidence) or len(fitted) == 0:
         raise CalibrationError(
             f"calibrate.data: expected accepted samples of at least {needed(confidence)} load paths to calibrate a "
@@ -84,7 +84,7 @@ def calibrate(
             f"{len(fitted)} samples in the {fitted_on} split of {data.path}; {_A_RANGE} paths and more for each range "
             "of size make the bound one to go by."
         )
-    _compare_loads(surrogate, data)
+    _compare_loads(surrogate, data, split)
     reader = SignReader(surrogate)
     shown, errors = _seen(reader, data, held)
     shown_before, errors_before = _seen(reader, data, fitted)
@@ -145,11 +145,6 @@ def _bounds(before: _Seen, seen: _Seen, paths: Ints, confidence: float) -> dict[
 
 def _first(samples: Samples, count: int) -> Samples:
     return Samples(**{field.name: getattr(samples, field.name)[:count] for field in fields(samples)})
-
-
-def _paths(data: DataSet, samples: Samples) -> Ints:
-    """Number of the load path of each sample, (s,)."""
-    return samples.draws // int(stored_plan(data.header).get("ramp", 1))
 
 
 def _seen(reader: SignReader, data: DataSet, samples: Samples, newton: bool = False) -> _Seen:
@@ -269,19 +264,26 @@ def _ratio(bounds: Floats, errors: Floats) -> float | None:
     return float(np.median(bounds) / np.median(errors)) if len(errors) else None
 
 
-def _compare_loads(surrogate: Surrogate, data: DataSet) -> None:
-    learned, drawn = (
-        {**plan["loads"], "ramp": plan.get("ramp", 1)} if plan.get("loads") else None
-        for plan in (surrogate.card.get("data", {}).get("plan", {}), stored_plan(data.header))
+def _compare_loads(surrogate: Surrogate, data: DataSet, split: Split) -> None:
+    """Say where the loads to calibrate on are drawn otherwise than those that were learned, or nobody knows."""
+    learned, drawn = _ways(stored_plans(surrogate.card.get("data", {}))), _ways(stored_plans(data.header, split))
+    unknown = "its loads" if None in drawn else "the loads that were learned" if None in learned else ""
+    if unknown:
+        told = f"nothing is known of how {unknown} were drawn"
+    elif all(way in learned for way in drawn) and all(way in drawn for way in learned):
+        return
+    else:
+        pairs = [(one or {}, other or {}) for one in drawn for other in learned]
+        names = dict.fromkeys(name for one, other in pairs for name in one | other if one.get(name) != other.get(name))
+        told = f"its loads are drawn otherwise than those that were learned (in {', '.join(names)})"
+    warnings.warn(
+        f"calibrate.data: {told}; the bound holds for loads like these alone.", CalibrationWarning, stacklevel=3
     )
-    if learned is not None and drawn is not None and learned != drawn:
-        differing = [name for name in drawn if learned.get(name) != drawn[name]]
-        warnings.warn(
-            f"calibrate.data: its loads are drawn otherwise than those that were learned (in {', '.join(differing)}); "
-            "the bound holds for loads like these alone.",
-            CalibrationWarning,
-            stacklevel=3,
-        )
+
+
+def _ways(plans: list[dict[str, Any]]) -> list[dict[str, Any] | None]:
+    """How each plan says that loads are drawn; None where it does not."""
+    return [{**plan["loads"], "ramp": plan.get("ramp", 1)} if plan.get("loads") else None for plan in plans]
 
 
 def _fitted(shown: list[Signs], found: dict[str, Floats], error: Error, confidence: float) -> Floats:

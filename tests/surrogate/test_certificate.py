@@ -341,6 +341,46 @@ def test_loads_drawn_otherwise_are_told(bare: Surrogate, data: DataSet) -> None:
         calibrate(bare, data)
 
 
+def merged_from(data: DataSet, *plans: dict) -> DataSet:
+    """The same data as if they were merged from sets of these plans, the first of all draws but the calibration's."""
+    splits = [[split for split in COUNTS if split != "calibration"], ["calibration"]]
+    same = DataSet(data.path)
+    same.header["merged"] = [
+        {"identity": "", "samples": {split: COUNTS[split] for split in some}, "plan": plan}
+        for some, plan in zip(splits, plans, strict=True)
+    ]
+    return same
+
+
+def test_every_set_that_was_merged_is_compared(bare: Surrogate, data: DataSet) -> None:
+    """Those that the calibration draws are of, whatever the first of them says."""
+    plan = data.header["plan"]
+    other = {**plan, "loads": {**plan["loads"], "patches": 3}}
+    with pytest.warns(CalibrationWarning, match=r"drawn otherwise than those that were learned \(in patches\)"):
+        calibrate(bare, merged_from(data, plan, other), stepped=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        calibrate(bare, merged_from(data, other, plan), stepped=0)
+
+
+def test_paths_of_merged_sets_count_as_they_were_drawn(bare: Surrogate, data: DataSet) -> None:
+    """256 draws along paths of eight, behind a set of single ones: 32, in sets merged before that was refused."""
+    plan = data.header["plan"]
+    with pytest.warns(CalibrationWarning, match=r"\(in ramp\)"):
+        entry = calibrate(bare, merged_from(data, plan, {**plan, "ramp": 8}), stepped=0).card["certificate"]
+    assert (entry["samples"], entry["load_paths"]) == (256, 32)
+
+
+def test_loads_of_which_nothing_is_known_are_told(bare: Surrogate, data: DataSet) -> None:
+    silent = DataSet(data.path)
+    silent.header["plan"] = {name: entry for name, entry in data.header["plan"].items() if name != "loads"}
+    with pytest.warns(CalibrationWarning, match="nothing is known of how its loads were drawn"):
+        calibrate(bare, silent, stepped=0)
+    of_own_data = bare.with_card(data={**bare.card["data"], "plan": silent.header["plan"]})
+    with pytest.warns(CalibrationWarning, match="nothing is known of how the loads that were learned were drawn"):
+        calibrate(of_own_data, data, stepped=0)
+
+
 def test_a_twin_that_was_not_calibrated_has_no_certificate(bare: Surrogate) -> None:
     with pytest.raises(CalibrationError, match=r"expected a twin that was calibrated.*samples\.calibration"):
         Certifier(bare)
