@@ -66,9 +66,13 @@ class Certifier:
     def certify(self, forces: ArrayLike, state: SurrogateState | None = None, newton: bool = False) -> Certificate:
         """How wrong the prediction for nodal forces may be.
 
+        Forces on nodes that the surrogate never saw loaded are no part of a prediction: of a load with such forces
+        nothing is bounded, and the certificate says so.
+
         Args:
             forces: (n, 3), newtons.
-            state: what the surrogate predicts for them, if that is known.
+            state: what the surrogate predicts for them (those on nodes that it never saw loaded left out), if that is
+                known.
             newton: read the bounds from one step of Newton's method: dearer, much tighter, and it tells whether the
                 prediction is stable.
 
@@ -77,7 +81,11 @@ class Certifier:
             CalibrationError: such a step was never calibrated.
         """
         load = checked_array("Certifier.forces", forces, self.reader.surrogate.body.points.shape)
-        return self.read(self.reader.read(load, state or self.reader.surrogate.solve(load), newton))
+        if state is None:
+            known = load.copy()
+            known[self.reader.surrogate.unseen(load)] = 0.0
+            state = self.reader.surrogate.solve(known)
+        return self.read(self.reader.read(load, state, newton))
 
     def read(self, signs: Signs) -> Certificate:
         """What signs say.
@@ -103,8 +111,14 @@ class Certifier:
         limits, found = self._known["limits"], []
         if not np.isfinite(signs.residual):
             found.append("the prediction turns a cell inside out or has no balance to speak of")
-        if signs.extent is not None and signs.extent > 1.0:
-            found.append(f"the load lies {signs.extent:.2g} times as far out as the farthest of the training")
+        if signs.unseen:
+            found.append(
+                f"it acts on {signs.unseen} nodes that never carried load in training: the prediction leaves that out"
+            )
+        if signs.distance is not None and signs.distance > 1.0:
+            found.append(f"the load lies {signs.distance:.2g} times as far out as the farthest of the training")
+        elif signs.is_inside is False:
+            found.append(f"it moves a node {signs.extent:.2g} times as far as any load of the training")
         away = usual_ratio(signs, limits.get("load"))
         if away is not None and away > 1.0:
             found.append(f"it lies {away:.2g} times as far out as is usual among loads on the nodes that it acts on")

@@ -66,6 +66,11 @@ def loads(data: DataSet, count: int) -> list[np.ndarray]:
     return out
 
 
+def of_nobody(displacement: np.ndarray) -> SimpleNamespace:
+    """A state that no network predicts."""
+    return SimpleNamespace(displacement=displacement, distance=0.5, extent=0.5, is_inside=True)
+
+
 # ---------------------------------------------------------------------- what they are worth
 
 
@@ -118,16 +123,60 @@ def test_a_higher_confidence_is_a_wider_bound(bare: Surrogate, data: DataSet, su
 
 
 def test_loads_far_beyond_those_learned_are_set_aside_and_not_refused(surrogate: Surrogate, data: DataSet) -> None:
+    """Half as large as the largest that are drawn they are as usual as any, to three deviations of the limits' share."""
     certifier, tops = Certifier(surrogate), [ramp_loads(data, PLAN, 10**6 + i)[0] for i in range(64)]
-    near, far = ([certifier.certify(scale * top) for top in tops] for scale in (0.9, 3.0))
-    assert sum(each.is_inside for each in near) >= 60
+    near, far = ([certifier.certify(scale * top) for top in tops] for scale in (0.5, 3.0))
+    share = 0.03 + 1.0 / 257.0
+    assert np.mean([not each.is_inside for each in near]) < share + 3.0 * np.sqrt(share / 64 + share / 256)
     assert not any(each.is_inside for each in far)
     assert "times as far out as the farthest" in " ".join(reason for each in far for reason in each.reasons)
     assert all(np.isfinite(each.mean) for each in near)
 
 
+@pytest.mark.parametrize("newton", [False, True])
+def test_a_load_where_none_was_learned_is_outside_and_not_refused(
+    surrogate: Surrogate, data: DataSet, newton: bool
+) -> None:
+    """The prediction leaves it out, and the forces out of balance do not."""
+    certifier, load = Certifier(surrogate), loads(data, 1)[0]
+    usual, state = certifier.certify(load, newton=newton), surrogate.solve(load)
+    inner = np.setdiff1d(surrogate.body.free, surrogate.maps.loaded)[:2]
+    load[inner, 1] = 0.1
+    with pytest.raises(ValueError, match="at 2 other nodes"):
+        surrogate.solve(load)
+    found = certifier.certify(load, newton=newton)
+    assert found.mean == found.largest == np.inf and not found.is_inside
+    assert "it acts on 2 nodes that never carried load in training: the prediction leaves that out" in found.reasons
+    assert usual.signs.unseen == 0 and found.signs.unseen == 2
+    assert found.signs.size == usual.signs.size
+    assert certifier.certify(load, state, newton) == found
+    alone = np.zeros_like(load)
+    alone[inner] = load[inner]
+    nothing = certifier.certify(alone, newton=newton)
+    assert nothing.mean == np.inf and nothing.signs.size == 0.0 and nothing.signs.residual == pytest.approx(1.0)
+
+
+def test_forces_at_fixed_nodes_change_no_certificate(surrogate: Surrogate, data: DataSet) -> None:
+    load = loads(data, 1)[0]
+    usual = Certifier(surrogate).certify(load)
+    load[surrogate.body.fixed, 0] = 100.0
+    assert Certifier(surrogate).certify(load) == usual
+
+
+def test_the_first_tier_is_the_load_s_and_the_next_what_it_moves(surrogate: Surrogate, data: DataSet) -> None:
+    """Of one load: too large in the network's coordinates, or no larger than usual on a body that moved less."""
+    load = loads(data, 1)[0]
+    state = surrogate.solve(load)
+    far = Certifier(surrogate).certify(1.2 / state.distance * load)
+    assert "the load lies 1.2 times as far out as the farthest of the training" in far.reasons
+    domain = {**surrogate.card["domain"], "displacement_m": far.signs.size / 10.0}
+    moved = Certifier(surrogate.with_card(domain=domain)).certify(load)
+    assert moved.signs.distance == state.distance < 1.0 and moved.signs.is_inside is False
+    assert any("times as far as any load of the training" in reason for reason in moved.reasons)
+
+
 def test_a_prediction_inside_out_has_no_bound(surrogate: Surrogate, data: DataSet) -> None:
-    wrong = SimpleNamespace(displacement=-2.0 * data.body.points, extent=0.5)
+    wrong = of_nobody(-2.0 * data.body.points)
     found = Certifier(surrogate).certify(loads(data, 1)[0], wrong)
     assert found.mean == found.largest == np.inf and not found.is_inside
     assert "inside out" in found.reasons[0]
@@ -182,15 +231,16 @@ def test_the_step_is_the_reference_s_from_the_tangent_at_rest(
 
 def test_the_newton_step_is_the_reference_s_with_its_inertia(bare: Surrogate, data: DataSet, small: Body) -> None:
     """From a prediction, and from a state that is pressed together so much that it is none to stay in."""
-    force, reader = loads(data, 1)[0], SignReader(bare)
-    pressed = np.zeros_like(small.points)
+    reader, pressed = SignReader(bare), np.zeros_like(small.points)
     pressed[:, 0] = -0.3 * small.points[:, 0]
     with Problem(small, PLAN.build_material()) as problem:
+        # A third of so rough a network's predictions are unstable, and which ones depends on the machine's rounding.
+        force = next(load for load in loads(data, 16) if problem.negative_pivots(bare.solve(load).displacement) == 0)
         for displacement, is_stable in ((bare.solve(force).displacement, True), (pressed, False)):
             gap = problem.internal_forces(displacement) - force
             gap[small.fixed] = 0.0
             step = np.linalg.norm(problem.apply_inverse(gap.ravel(), displacement).reshape(-1, 3), axis=1)
-            found = reader.read(force, SimpleNamespace(displacement=displacement, extent=None), newton=True).newton
+            found = reader.read(force, of_nobody(displacement), newton=True).newton
             np.testing.assert_allclose((found.mean, found.largest), (step.mean(), step.max()), rtol=1e-6)
             assert found.negative_pivots == problem.negative_pivots(displacement)
             assert (found.negative_pivots == 0) == is_stable
@@ -199,14 +249,14 @@ def test_the_newton_step_is_the_reference_s_with_its_inertia(bare: Surrogate, da
 def test_an_unstable_prediction_is_set_aside(surrogate: Surrogate, small: Body) -> None:
     pressed = np.zeros_like(small.points)
     pressed[:, 0] = -0.3 * small.points[:, 0]
-    state = SimpleNamespace(displacement=pressed, extent=0.5)
+    state = of_nobody(pressed)
     found = Certifier(surrogate).certify(np.zeros_like(small.points), state, newton=True)
     assert found.signs.newton is not None and found.signs.newton.negative_pivots
     assert f"unstable: its tangent has {found.signs.newton.negative_pivots} negative pivots" in " ".join(found.reasons)
 
 
 def test_a_prediction_inside_out_has_no_newton_step(surrogate: Surrogate, data: DataSet) -> None:
-    wrong = SimpleNamespace(displacement=-2.0 * data.body.points, extent=0.5)
+    wrong = of_nobody(-2.0 * data.body.points)
     found = Certifier(surrogate).certify(loads(data, 1)[0], wrong, newton=True)
     assert found.mean == found.largest == np.inf and "finds no step" in found.reasons[-1]
 
