@@ -123,7 +123,7 @@ def test_a_higher_confidence_is_a_wider_bound(bare: Surrogate, data: DataSet, su
 
 
 def test_loads_far_beyond_those_learned_are_set_aside_and_not_refused(surrogate: Surrogate, data: DataSet) -> None:
-    """Half as large as the largest that are drawn they are as usual as any, to three deviations of the limits' share."""
+    """Half as large as the largest that are drawn they are as usual as any, to three deviations of chance."""
     certifier, tops = Certifier(surrogate), [ramp_loads(data, PLAN, 10**6 + i)[0] for i in range(64)]
     near, far = ([certifier.certify(scale * top) for top in tops] for scale in (0.5, 3.0))
     share = 0.03 + 1.0 / 257.0
