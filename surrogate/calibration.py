@@ -20,12 +20,13 @@ from scipy.stats import spearmanr
 from softtwin.meshes.metrics import nodal_distances
 from softtwin.reference.data.dataset import DataSet, Samples, Split, stored_plans
 
-from .certificate import ERRORS, Certifier
+from .certificate import ERRORS, Certifier, range_of
 from .model import Surrogate
 from .signs import CalibrationError, Error, SignReader, Signs
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Seen = tuple[list[Signs], dict[str, Floats]]  # signs of predictions and true errors, metres, by kind
 _A_RANGE = 50  # calibration samples that a range of its own should have
 _RANGES = 4  # of size, at most
 _USUAL = 0.99  # of the calibration samples: who is farther out of balance is set aside
@@ -86,12 +87,12 @@ def calibrate(
         )
     _compare_loads(surrogate, data, split)
     reader = SignReader(surrogate)
-    shown, errors = _seen(reader, data, held)
-    shown_before, errors_before = _seen(reader, data, fitted)
+    shown, errors = read_samples(reader, data, held)
+    shown_before, errors_before = read_samples(reader, data, fitted)
     entry = {
         "confidence": confidence,
         "split": split,
-        **_bounds((shown_before, errors_before), (shown, errors), paths, confidence),
+        **fitted_bounds((shown_before, errors_before), (shown, errors), paths, confidence),
         "limits": {
             name: _limit([getattr(signs, name) for signs in shown], share)
             for name, share in (("size", 1.0), ("residual", _USUAL), ("step", _USUAL))
@@ -100,15 +101,14 @@ def calibrate(
     if shown[0].load is not None:
         entry["limits"]["load"] = _usual_load(shown_before, shown, confidence)
     if len(np.unique(paths[:stepped])) >= needed(confidence):
-        before, after = (_seen(reader, data, _first(samples, stepped), newton=True) for samples in (fitted, held))
-        entry["newton"] = _bounds(before, after, paths[:stepped], confidence)
+        before, after = (
+            read_samples(reader, data, _first(samples, stepped), newton=True) for samples in (fitted, held)
+        )
+        entry["newton"] = fitted_bounds(before, after, paths[:stepped], confidence)
     return surrogate.with_card(certificate=entry)
 
 
-_Seen = tuple[list[Signs], dict[str, Floats]]
-
-
-def _bounds(before: _Seen, seen: _Seen, paths: Ints, confidence: float) -> dict[str, Any]:
+def fitted_bounds(before: Seen, seen: Seen, paths: Ints, confidence: float) -> dict[str, Any]:
     """Powers of the signs and the quantile of what is left, for each range of size.
 
     Args:
@@ -147,8 +147,15 @@ def _first(samples: Samples, count: int) -> Samples:
     return Samples(**{field.name: getattr(samples, field.name)[:count] for field in fields(samples)})
 
 
-def _seen(reader: SignReader, data: DataSet, samples: Samples, newton: bool = False) -> _Seen:
-    """Signs of the predictions of samples, and their true errors, metres, (s,) each."""
+def read_samples(reader: SignReader, data: DataSet, samples: Samples, newton: bool = False) -> Seen:
+    """Signs of the predictions of samples, and their true errors, metres, (s,) each.
+
+    Args:
+        reader: of the surrogate's predictions.
+        data: the data set.
+        samples: of it.
+        newton: with a step of Newton's method each.
+    """
     forces, shown, found = np.zeros_like(data.body.points), [], np.empty_like(samples.displacements)
     for i, load in enumerate(samples.forces):
         forces[data.response.loaded] = load
@@ -225,14 +232,13 @@ def coverage(
         DataSetError: the split is not complete.
     """
     certifier = Certifier(surrogate)
-    shown, errors = _seen(certifier.reader, data, data.samples(split, limit), newton)
+    shown, errors = read_samples(certifier.reader, data, data.samples(split, limit), newton)
     given = [certifier.read(signs) for signs in shown]
     bounds = {error: np.array([getattr(each, error) for each in given]) for error in ERRORS}
     eta = np.array([signs.step for signs in shown])
-    known = surrogate.card["certificate"]
-    edges = (known["newton"] if newton else known)["edges"]
-    places = np.searchsorted(edges, [each.signs.size for each in given], side="right")
-    members = [places == place for place in range(len(edges) + 1)]
+    known = surrogate.card["certificate"]["newton"] if newton else surrogate.card["certificate"]
+    places = np.array([range_of(known, signs) for signs in shown])
+    members = [places == place for place in range(len(known["edges"]) + 1)]
     kept = {error: errors[error] <= bounds[error] for error in ERRORS}
     return Coverage(
         split=split,

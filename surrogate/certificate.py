@@ -93,17 +93,13 @@ class Certifier:
         Raises:
             CalibrationError: a step of Newton's method is among them, and such steps were never calibrated.
         """
-        known, bounds = self._known if signs.newton is None else self._known.get("newton"), {}
+        known = self._known if signs.newton is None else self._known.get("newton")
         if not known:
             raise CalibrationError(
                 "Certifier.newton: expected a twin whose steps of Newton's method were calibrated, got none in its "
                 "card; calibrate it anew, with `stepped` at what is needed or more."
             )
-        place = int(np.searchsorted(known["edges"], signs.size, side="right"))
-        for error in ERRORS:
-            factor = known["quantiles"][error][place]
-            is_known = factor is not None and signs.is_finite
-            bounds[error] = float(factor * np.exp(signs.row(error) @ known["powers"][error])) if is_known else np.inf
+        bounds = {error: bound(known, signs, error) for error in ERRORS}
         reasons = tuple(self._reasons(signs))
         return Certificate(**bounds, confidence=self._known["confidence"], signs=signs, reasons=reasons)
 
@@ -129,6 +125,25 @@ class Certifier:
         if limits["step"] < signs.step < np.inf:
             found.append(f"balance is {1e3 * signs.step:.3g} mm away, farther than is usual")
         return found if signs.newton is None else found + _unstable(signs.newton)
+
+
+def bound(known: Mapping[str, Any], signs: Signs, error: Error) -> float:
+    """Bound on an error, metres; infinite where nothing can be said.
+
+    Args:
+        known: edges of the ranges of size, powers and quantiles, as `calibration.fitted_bounds` finds them.
+        signs: of a prediction.
+        error: whose.
+    """
+    factor = known["quantiles"][error][range_of(known, signs)]
+    if factor is None or not signs.is_finite:
+        return float(np.inf)
+    return float(factor * np.exp(signs.row(error) @ known["powers"][error]))
+
+
+def range_of(known: Mapping[str, Any], signs: Signs) -> int:
+    """Number of the range of size that a prediction falls in, as `bound` has it."""
+    return int(np.searchsorted(known["edges"], signs.size, side="right"))
 
 
 def usual_ratio(signs: Signs, known: Mapping[str, Any] | None) -> float | None:

@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
+import certificates
+
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
@@ -204,6 +206,50 @@ def test_a_saved_twin_keeps_its_certificate(surrogate: Surrogate, data: DataSet,
     again = load(tmp_path, data.body)
     force = loads(data, 1)[0]
     assert Certifier(again).certify(force) == Certifier(surrogate).certify(force)
+
+
+def test_other_splits_keep_as_many_bounds_and_scatter_as_chance_does(
+    surrogate: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 20 ways: the mean to three deviations of their mean, above by what rounding up in ranges of 64 adds at most.
+
+    The spread of so few is itself good to a sixth; were loads judged that calibrate, there would be next to none.
+    """
+    reads, read = [], SignReader.read
+    monkeypatch.setattr(SignReader, "read", lambda self, *given: (reads.append(1), read(self, *given))[1])
+    found = certificates.resplit(surrogate, data)
+    assert len(reads) == sum(len(data.samples(split)) for split in ("validation", "calibration", "test"))
+    assert found["ways"] == 20 and sum(found["load_paths"]) == len(reads) - len(data.samples("validation"))
+    whole, part = np.sqrt(2 * 0.09 / 256), np.sqrt(2 * 0.09 / 64)
+    for error in ("mean", "largest"):
+        kept, ranges = found["kept"][error], found["kept_in_range"][error]
+        assert -3.0 * whole / np.sqrt(20) < kept["mean"] - 0.9 < 1.0 / 64 + 3.0 * whole / np.sqrt(20)
+        assert 0.5 * whole < kept["spread"] < 1.5 * whole
+        assert len(ranges["mean"]) == 4 and all(0.5 * part < spread < 1.5 * part for spread in ranges["spread"])
+        assert all(abs(mean - 0.9) < 1.0 / 64 + 3.0 * part / np.sqrt(20) for mean in ranges["mean"])
+
+
+def test_the_table_of_certificates_at_a_small_size(
+    surrogate: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is recorded; a row that lacks other splits alone is given these, and one that is whole is left."""
+    rows: dict = {}
+    for name, value in {
+        "FAR": 4, "TIMED": 2, "case": lambda body: SimpleNamespace(plan=PLAN), "data_of": lambda *asked: data,
+        "network_of": lambda *asked: surrogate, "recorded": lambda name: rows, "write": lambda name, found: None,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(certificates, name, value)
+    certificates.main(["--bodies", "small", "--stepped", "12"])
+    row = rows["small"]
+    assert row["held_out_newton"]["samples"] == 12 and row["resplit"]["made"]["command"]
+    ms = row["ms"]
+    assert set(ms) == {"prediction", "distance", "extent", "certificate", "newton", "solve"} and min(ms.values()) > 0.0
+    before = {name: row[name] for name in row if name != "resplit"}
+    del row["resplit"]
+    certificates.main(["--bodies", "small"])
+    assert all(row[name] is entry for name, entry in before.items()) and row["resplit"]["ways"] == 20
+    certificates.main(["--bodies", "small"])
+    assert "small: recorded before" in capsys.readouterr().out
 
 
 # ---------------------------------------------------------------------- what they are read from
