@@ -18,14 +18,15 @@ from scipy.optimize import linprog
 from scipy.stats import spearmanr
 
 from softtwin.meshes.metrics import nodal_distances
-from softtwin.reference.data.dataset import DataSet, Samples, Split, stored_plan
+from softtwin.reference.data.dataset import DataSet, Samples, Split, stored_plans
 
-from .certificate import ERRORS, Certifier
+from .certificate import ERRORS, Certifier, range_of
 from .model import Surrogate
 from .signs import CalibrationError, Error, SignReader, Signs
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Seen = tuple[list[Signs], dict[str, Floats]]  # signs of predictions and true errors, metres, by kind
 _A_RANGE = 50  # calibration samples that a range of its own should have
 _RANGES = 4  # of size, at most
 _USUAL = 0.99  # of the calibration samples: who is farther out of balance is set aside
@@ -76,7 +77,7 @@ def calibrate(
     if wrong:
         raise CalibrationError(f"calibrate.data: {data.path} is of another material than the surrogate: {wrong[0]}.")
     held, fitted = data.samples(split), data.samples(fitted_on)
-    paths = _paths(data, held)
+    paths = data.load_paths(split, held.draws)
     if len(np.unique(paths)) < needed(confidence) or len(fitted) == 0:
         raise CalibrationError(
             f"calibrate.data: expected accepted samples of at least {needed(confidence)} load paths to calibrate a "
@@ -84,14 +85,14 @@ def calibrate(
             f"{len(fitted)} samples in the {fitted_on} split of {data.path}; {_A_RANGE} paths and more for each range "
             "of size make the bound one to go by."
         )
-    _compare_loads(surrogate, data)
+    _compare_loads(surrogate, data, split)
     reader = SignReader(surrogate)
-    shown, errors = _seen(reader, data, held)
-    shown_before, errors_before = _seen(reader, data, fitted)
+    shown, errors = read_samples(reader, data, held)
+    shown_before, errors_before = read_samples(reader, data, fitted)
     entry = {
         "confidence": confidence,
         "split": split,
-        **_bounds((shown_before, errors_before), (shown, errors), paths, confidence),
+        **fitted_bounds((shown_before, errors_before), (shown, errors), paths, confidence),
         "limits": {
             name: _limit([getattr(signs, name) for signs in shown], share)
             for name, share in (("size", 1.0), ("residual", _USUAL), ("step", _USUAL))
@@ -100,15 +101,14 @@ def calibrate(
     if shown[0].load is not None:
         entry["limits"]["load"] = _usual_load(shown_before, shown, confidence)
     if len(np.unique(paths[:stepped])) >= needed(confidence):
-        before, after = (_seen(reader, data, _first(samples, stepped), newton=True) for samples in (fitted, held))
-        entry["newton"] = _bounds(before, after, paths[:stepped], confidence)
+        before, after = (
+            read_samples(reader, data, _first(samples, stepped), newton=True) for samples in (fitted, held)
+        )
+        entry["newton"] = fitted_bounds(before, after, paths[:stepped], confidence)
     return surrogate.with_card(certificate=entry)
 
 
-_Seen = tuple[list[Signs], dict[str, Floats]]
-
-
-def _bounds(before: _Seen, seen: _Seen, paths: Ints, confidence: float) -> dict[str, Any]:
+def fitted_bounds(before: Seen, seen: Seen, paths: Ints, confidence: float) -> dict[str, Any]:
     """Powers of the signs and the quantile of what is left, for each range of size.
 
     Args:
@@ -147,13 +147,15 @@ def _first(samples: Samples, count: int) -> Samples:
     return Samples(**{field.name: getattr(samples, field.name)[:count] for field in fields(samples)})
 
 
-def _paths(data: DataSet, samples: Samples) -> Ints:
-    """Number of the load path of each sample, (s,)."""
-    return samples.draws // int(stored_plan(data.header).get("ramp", 1))
+def read_samples(reader: SignReader, data: DataSet, samples: Samples, newton: bool = False) -> Seen:
+    """Signs of the predictions of samples, and their true errors, metres, (s,) each.
 
-
-def _seen(reader: SignReader, data: DataSet, samples: Samples, newton: bool = False) -> _Seen:
-    """Signs of the predictions of samples, and their true errors, metres, (s,) each."""
+    Args:
+        reader: of the surrogate's predictions.
+        data: the data set.
+        samples: of it.
+        newton: with a step of Newton's method each.
+    """
     forces, shown, found = np.zeros_like(data.body.points), [], np.empty_like(samples.displacements)
     for i, load in enumerate(samples.forces):
         forces[data.response.loaded] = load
@@ -230,14 +232,13 @@ def coverage(
         DataSetError: the split is not complete.
     """
     certifier = Certifier(surrogate)
-    shown, errors = _seen(certifier.reader, data, data.samples(split, limit), newton)
+    shown, errors = read_samples(certifier.reader, data, data.samples(split, limit), newton)
     given = [certifier.read(signs) for signs in shown]
     bounds = {error: np.array([getattr(each, error) for each in given]) for error in ERRORS}
     eta = np.array([signs.step for signs in shown])
-    known = surrogate.card["certificate"]
-    edges = (known["newton"] if newton else known)["edges"]
-    places = np.searchsorted(edges, [each.signs.size for each in given], side="right")
-    members = [places == place for place in range(len(edges) + 1)]
+    known = surrogate.card["certificate"]["newton"] if newton else surrogate.card["certificate"]
+    places = np.array([range_of(known, signs) for signs in shown])
+    members = [places == place for place in range(len(known["edges"]) + 1)]
     kept = {error: errors[error] <= bounds[error] for error in ERRORS}
     return Coverage(
         split=split,
@@ -269,19 +270,26 @@ def _ratio(bounds: Floats, errors: Floats) -> float | None:
     return float(np.median(bounds) / np.median(errors)) if len(errors) else None
 
 
-def _compare_loads(surrogate: Surrogate, data: DataSet) -> None:
-    learned, drawn = (
-        {**plan["loads"], "ramp": plan.get("ramp", 1)} if plan.get("loads") else None
-        for plan in (surrogate.card.get("data", {}).get("plan", {}), stored_plan(data.header))
+def _compare_loads(surrogate: Surrogate, data: DataSet, split: Split) -> None:
+    """Say where the loads to calibrate on are drawn otherwise than those that were learned, or nobody knows."""
+    learned, drawn = _ways(stored_plans(surrogate.card.get("data", {}))), _ways(stored_plans(data.header, split))
+    unknown = "its loads" if None in drawn else "the loads that were learned" if None in learned else ""
+    if unknown:
+        told = f"nothing is known of how {unknown} were drawn"
+    elif all(way in learned for way in drawn) and all(way in drawn for way in learned):
+        return
+    else:
+        pairs = [(one or {}, other or {}) for one in drawn for other in learned]
+        names = dict.fromkeys(name for one, other in pairs for name in one | other if one.get(name) != other.get(name))
+        told = f"its loads are drawn otherwise than those that were learned (in {', '.join(names)})"
+    warnings.warn(
+        f"calibrate.data: {told}; the bound holds for loads like these alone.", CalibrationWarning, stacklevel=3
     )
-    if learned is not None and drawn is not None and learned != drawn:
-        differing = [name for name in drawn if learned.get(name) != drawn[name]]
-        warnings.warn(
-            f"calibrate.data: its loads are drawn otherwise than those that were learned (in {', '.join(differing)}); "
-            "the bound holds for loads like these alone.",
-            CalibrationWarning,
-            stacklevel=3,
-        )
+
+
+def _ways(plans: list[dict[str, Any]]) -> list[dict[str, Any] | None]:
+    """How each plan says that loads are drawn; None where it does not."""
+    return [{**plan["loads"], "ramp": plan.get("ramp", 1)} if plan.get("loads") else None for plan in plans]
 
 
 def _fitted(shown: list[Signs], found: dict[str, Floats], error: Error, confidence: float) -> Floats:

@@ -66,9 +66,13 @@ class Certifier:
     def certify(self, forces: ArrayLike, state: SurrogateState | None = None, newton: bool = False) -> Certificate:
         """How wrong the prediction for nodal forces may be.
 
+        Forces on nodes that the surrogate never saw loaded are no part of a prediction: of a load with such forces
+        nothing is bounded, and the certificate says so.
+
         Args:
             forces: (n, 3), newtons.
-            state: what the surrogate predicts for them, if that is known.
+            state: what the surrogate predicts for them (those on nodes that it never saw loaded left out), if that is
+                known.
             newton: read the bounds from one step of Newton's method: dearer, much tighter, and it tells whether the
                 prediction is stable.
 
@@ -77,7 +81,11 @@ class Certifier:
             CalibrationError: such a step was never calibrated.
         """
         load = checked_array("Certifier.forces", forces, self.reader.surrogate.body.points.shape)
-        return self.read(self.reader.read(load, state or self.reader.surrogate.solve(load), newton))
+        if state is None:
+            known = load.copy()
+            known[self.reader.surrogate.unseen(load)] = 0.0
+            state = self.reader.surrogate.solve(known)
+        return self.read(self.reader.read(load, state, newton))
 
     def read(self, signs: Signs) -> Certificate:
         """What signs say.
@@ -85,17 +93,13 @@ class Certifier:
         Raises:
             CalibrationError: a step of Newton's method is among them, and such steps were never calibrated.
         """
-        known, bounds = self._known if signs.newton is None else self._known.get("newton"), {}
+        known = self._known if signs.newton is None else self._known.get("newton")
         if not known:
             raise CalibrationError(
                 "Certifier.newton: expected a twin whose steps of Newton's method were calibrated, got none in its "
                 "card; calibrate it anew, with `stepped` at what is needed or more."
             )
-        place = int(np.searchsorted(known["edges"], signs.size, side="right"))
-        for error in ERRORS:
-            factor = known["quantiles"][error][place]
-            is_known = factor is not None and signs.is_finite
-            bounds[error] = float(factor * np.exp(signs.row(error) @ known["powers"][error])) if is_known else np.inf
+        bounds = {error: bound(known, signs, error) for error in ERRORS}
         reasons = tuple(self._reasons(signs))
         return Certificate(**bounds, confidence=self._known["confidence"], signs=signs, reasons=reasons)
 
@@ -103,8 +107,14 @@ class Certifier:
         limits, found = self._known["limits"], []
         if not np.isfinite(signs.residual):
             found.append("the prediction turns a cell inside out or has no balance to speak of")
-        if signs.extent is not None and signs.extent > 1.0:
-            found.append(f"the load lies {signs.extent:.2g} times as far out as the farthest of the training")
+        if signs.unseen:
+            found.append(
+                f"it acts on {signs.unseen} nodes that never carried load in training: the prediction leaves that out"
+            )
+        if signs.distance is not None and signs.distance > 1.0:
+            found.append(f"the load lies {signs.distance:.2g} times as far out as the farthest of the training")
+        elif signs.is_inside is False:
+            found.append(f"it moves a node {signs.extent:.2g} times as far as any load of the training")
         away = usual_ratio(signs, limits.get("load"))
         if away is not None and away > 1.0:
             found.append(f"it lies {away:.2g} times as far out as is usual among loads on the nodes that it acts on")
@@ -115,6 +125,25 @@ class Certifier:
         if limits["step"] < signs.step < np.inf:
             found.append(f"balance is {1e3 * signs.step:.3g} mm away, farther than is usual")
         return found if signs.newton is None else found + _unstable(signs.newton)
+
+
+def bound(known: Mapping[str, Any], signs: Signs, error: Error) -> float:
+    """Bound on an error, metres; infinite where nothing can be said.
+
+    Args:
+        known: edges of the ranges of size, powers and quantiles, as `calibration.fitted_bounds` finds them.
+        signs: of a prediction.
+        error: whose.
+    """
+    factor = known["quantiles"][error][range_of(known, signs)]
+    if factor is None or not signs.is_finite:
+        return float(np.inf)
+    return float(factor * np.exp(signs.row(error) @ known["powers"][error]))
+
+
+def range_of(known: Mapping[str, Any], signs: Signs) -> int:
+    """Number of the range of size that a prediction falls in, as `bound` has it."""
+    return int(np.searchsorted(known["edges"], signs.size, side="right"))
 
 
 def usual_ratio(signs: Signs, known: Mapping[str, Any] | None) -> float | None:

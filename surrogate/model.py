@@ -42,18 +42,34 @@ class SurrogateState:
         self.displacement: Floats = (maps.offset + linear + maps.decoded(self._inner.values.numpy())).reshape(-1, 3)
 
     @property
-    def extent(self) -> float | None:
-        """How far the load lies out: 1 at the farthest load of the training; None where that was not measured.
+    def distance(self) -> float | None:
+        """How far out the load lies in the network's own coordinates, each in units of its spread over the training.
 
-        The larger of two measures: the network's coordinates in units of their spread, and the largest displacement.
+        1 at the farthest load of the training; None where that was not measured. It costs next to nothing on any body.
         """
         spread, domain = self._surrogate.maps.spread, self._surrogate.card.get("domain")
         if spread is None or domain is None:
             return None
         scaled = self.coordinates / spread
-        far = np.sqrt(scaled @ scaled / len(scaled)) / domain["reach"]
-        moved = np.sqrt(np.einsum("ni,ni->n", self.displacement, self.displacement).max()) / domain["displacement_m"]
-        return float(max(far, moved))
+        return float(np.sqrt(scaled @ scaled / len(scaled)) / domain["reach"])
+
+    @property
+    def extent(self) -> float | None:
+        """How far the load lies out: 1 at the farthest load of the training; None where that was not measured.
+
+        The larger of `distance` and of the largest displacement of a node, relative to the largest of the training.
+        """
+        far = self.distance
+        if far is None:
+            return None
+        moved = np.sqrt(np.einsum("ni,ni->n", self.displacement, self.displacement).max())
+        return float(max(far, moved / self._surrogate.card["domain"]["displacement_m"]))
+
+    @property
+    def is_inside(self) -> bool | None:
+        """Whether the load lies among those that were learned (`extent` is 1 at most); None where nobody knows."""
+        extent = self.extent
+        return None if extent is None else extent <= 1.0
 
     def push(self, changes: ArrayLike) -> Floats:
         """J B, (3n, k), for changes of the forces B, (3n, k).
@@ -205,6 +221,10 @@ class Surrogate:
     def with_card(self, **entries: Any) -> Surrogate:
         """The same surrogate with more entries in its card, for instance held-out errors."""
         return Surrogate(self.body, self.maps, self.network, {**self.card, **entries})
+
+    def unseen(self, forces: Floats) -> Ints:
+        """Nodes that forces, (n, 3), act on though none did in training: of those a prediction would know nothing."""
+        return self._idle[np.abs(forces[self._idle]).max(axis=1) > 0.0]
 
     def at_loaded(self, name: str, columns: ArrayLike) -> Floats:
         """Columns of nodal forces (3n, k) at the loaded nodes, (3l, k).

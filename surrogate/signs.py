@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -52,7 +52,11 @@ class Signs:
     """What a prediction shows of its error.
 
     Args:
-        extent: how far out the load lies: 1 at the farthest of the training; None where that was not measured.
+        distance: how far out the load lies in the network's own coordinates: 1 at the farthest of the training; None
+            where that was not measured.
+        extent: likewise, and how far it moves the body (`SurrogateState.extent`).
+        is_inside: whether it lies among the loads that were learned, as that says; None likewise.
+        unseen: nodes that it acts on though none did in training: the prediction leaves these forces out.
         load: how far out it lies among the training loads on the nodes that it acts on, and the number of components of
             force there; None likewise (`load_distance`).
         size: largest predicted displacement of a node, metres.
@@ -62,7 +66,10 @@ class Signs:
         newton: a step of Newton's method; None where none was asked for.
     """
 
+    distance: float | None
     extent: float | None
+    is_inside: bool | None
+    unseen: int
     load: tuple[float, int] | None
     size: float
     residual: float
@@ -72,7 +79,8 @@ class Signs:
     @property
     def is_finite(self) -> bool:
         """Whether anything can be read from them."""
-        return bool(np.isfinite(self.residual) and (self.newton is None or np.isfinite(self.newton.mean)))
+        is_known = self.unseen == 0 and np.isfinite(self.residual)
+        return bool(is_known and (self.newton is None or np.isfinite(self.newton.mean)))
 
     def row(self, error: Error) -> Floats:
         """One, and the logarithms of size, residual, step and Newton's step if there is one: fitted powers multiply it.
@@ -133,21 +141,32 @@ class SignReader:
 
         Args:
             forces: (n, 3), newtons.
-            state: the prediction for them.
+            state: the prediction for them, without those on nodes that the surrogate never saw loaded.
             newton: make a step of Newton's method too, for which the tangent at the prediction is factored.
         """
         is_free = self._free.reshape(forces.shape)
         predicted = torch.from_numpy(np.where(is_free, state.displacement, 0.0))
         gap = np.where(is_free, self._elastic.internal_forces(predicted[None])[0].numpy() - forces, 0.0)
-        away, size = load_distance(self.surrogate, forces), float(np.linalg.norm(state.displacement, axis=1).max())
-        load, missing = float(np.linalg.norm(forces)), float(np.linalg.norm(gap))
+        # Forces at fixed nodes move nothing: they count neither as out of balance nor as load.
+        load, missing = float(np.linalg.norm(forces[is_free.all(axis=1)])), float(np.linalg.norm(gap))
+        seen = Signs(
+            distance=state.distance,
+            extent=state.extent,
+            is_inside=state.is_inside,
+            unseen=len(self.surrogate.unseen(forces)),
+            load=load_distance(self.surrogate, forces),
+            size=float(np.linalg.norm(state.displacement, axis=1).max()),
+            residual=np.inf,
+            step=np.inf,
+            newton=_NO_STEP if newton else None,
+        )
         if not np.isfinite(missing):
-            return Signs(state.extent, away, size, np.inf, np.inf, _NO_STEP if newton else None)
+            return seen
         turned = np.einsum("nji,nj->ni", self._rotations(predicted), gap)
         step = self._lengths(self._factor.solve(turned.ravel()[self._free])).mean()  # turning back changes no length
         residual = missing / load if load > 0.0 else (np.inf if missing > 0.0 else 0.0)
         newtons = self._newton_step(predicted, gap) if newton else None
-        return Signs(state.extent, away, size, residual, float(step), newtons)
+        return replace(seen, residual=residual, step=float(step), newton=newtons)
 
     def _newton_step(self, displacement: torch.Tensor, gap: Floats) -> NewtonStep:
         try:

@@ -91,6 +91,7 @@ def _card(data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], course:
             "identity": data.identity,
             "versions": data.header.get("versions", {}),
             "plan": data.header.get("plan", {}),
+            **{name: data.header[name] for name in ("merged",) if name in data.header},
         },
         "samples": {**{name: len(samples) for name, samples in splits.items()}, "rejected": dict(rejected)},
         "training": {

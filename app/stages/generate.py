@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -36,8 +37,8 @@ def generate_stage(
         configuration: the configuration file, read on rank 0 alone.
         redo: numbers of blocks to make again.
         again: throw away what is there.
-        part: solve the blocks of one part alone; what is missing in the end, active rounds and the Jacobians, the whole
-            stage makes.
+        part: solve the blocks of one part alone, and of active rounds what they have chosen already; what is missing in
+            the end, further rounds and the Jacobians, the whole stage makes.
 
     Raises:
         CalibrationError: active rounds are wanted of a material whose residual torch does not know.
@@ -65,7 +66,7 @@ def generate_stage(
     task = active.solver(space.config) if active else None
     data = generate(space.data, body, plan, comm, redo, again, part, task)
     assert data is not None
-    while active and (number := active.next_round(space.config, data)) is not None:
+    while active and part is None and (number := active.next_round(space.config, data)) is not None:
         comm.bcast(number, root=0)
         on_first(comm, partial(active.choose, space, data, number))
         data = generate(space.data, body, plan, comm, task=task)
@@ -128,4 +129,15 @@ def describe_data(data: DataSet) -> str:
 def _read(configuration: Path, part: Part | None) -> tuple[Workspace, Body, Any]:
     """The workspace, its body, and what active rounds are made with."""
     space = open_workspace(configuration)
-    return space, current_body(space), _active_rounds(space.config) if part is None else None
+    try:
+        active = _active_rounds(space.config)
+    except ConfigError as error:
+        if part is None:
+            raise
+        active = None  # a job of a cluster may do without torch
+        warnings.warn(
+            f"part {part}: {error} Draws that such rounds have chosen already are solved from rest, to the same "
+            "equilibria in more iterations.",
+            stacklevel=2,
+        )
+    return space, current_body(space), active

@@ -218,6 +218,16 @@ class DataSet:
             return [first]
         return [first, self.split_draws("active")[: None if limit is None else limit - len(first)]]
 
+    def load_paths(self, split: Split, draws: Ints) -> Ints:
+        """Number of the load path of each of some draws, (s,): draws of one `ramp` share one, draws of two sets none.
+
+        Args:
+            split: that they are of.
+            draws: their numbers, (s,).
+        """
+        every = np.concatenate([np.asarray(each, dtype=np.int64) for each in self.ranges(split)])
+        return _path_numbers(self.header, split)[np.searchsorted(every, draws)]
+
     def samples(self, split: Split, limit: int | None = None) -> Samples:
         """The accepted samples of a split, checked against their checksums.
 
@@ -475,6 +485,35 @@ def stored_plan(header: Mapping[str, Any]) -> dict[str, Any]:
     """The entries of the plan in a header, under today's names."""
     entries: dict[str, Any] = header.get("plan", {})
     return {_RENAMED.get(name, name): value for name, value in entries.items()}
+
+
+def stored_plans(header: Mapping[str, Any], split: Split | None = None) -> list[dict[str, Any]]:
+    """The plan in a header, or those of all the sets that it was merged from, under today's names.
+
+    Args:
+        header: of a data set.
+        split: leave out sets that have no draw of it.
+    """
+    if header.get("merged") is not None:
+        return [plan for entry in header["merged"] for plan in stored_plans(entry, split)]
+    return [stored_plan(header)] if split is None or header["samples"].get(split) else []
+
+
+def _path_numbers(header: Mapping[str, Any], split: Split) -> Ints:
+    """Number of the load path of each draw of a split, in the order in which `DataSet.ranges` has them."""
+    found: list[Ints] = [np.empty(0, dtype=np.int64)]
+    for count, ramp in _pieces(header, split):
+        found.append(np.arange(count) // ramp + 1 + max(numbers.max(initial=-1) for numbers in found))
+    return np.concatenate(found)
+
+
+def _pieces(header: Mapping[str, Any], split: Split) -> list[tuple[int, int]]:
+    """Draws of each set that a split was merged from, and of a ramp there: a ramp begins anew with each."""
+    if header.get("merged") is not None:
+        return [piece for entry in header["merged"] for piece in _pieces(entry, split)]
+    kinds = (split, "active") if split == "train" else (split,)
+    ramp = int(stored_plan(header).get("ramp", 1))
+    return [(int(header["samples"].get(kind, 0)), ramp) for kind in kinds]
 
 
 def differences(data: DataSet, body: Body, plan: Mapping[str, Any]) -> list[str]:

@@ -24,7 +24,8 @@ def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
     gone on with. Jacobians are not taken along: `generate` makes them again.
 
     Args:
-        sources: at least two, complete, of one body, one material and the same modes.
+        sources: at least two, complete, of one body, one material, the same modes and as many draws of each load path
+            (`ramp`): a bound that is calibrated on paths of two kinds holds for loads of neither.
         path: folder to make.
 
     Raises:
@@ -42,10 +43,7 @@ def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
         **{name: entry for name, entry in first.header.items() if name not in ("format", "body", "checksums")},
         "samples": counts,
         "plan": {**stored_plan(first.header), "samples": counts},
-        "merged": [
-            {"identity": source.identity, "samples": source.header["samples"], "plan": source.header.get("plan", {})}
-            for source in sources
-        ],
+        "merged": [_told(source) for source in sources],
     }
     partial = path.with_name(f".{path.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -57,6 +55,13 @@ def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
             number += 1
     partial.rename(path)
     return DataSet(path)
+
+
+def _told(source: DataSet) -> dict[str, Any]:
+    """What a merged set keeps of a source, with what that was merged from: where its load paths begin, for instance."""
+    header = source.header
+    known = {name: header[name] for name in ("merged",) if name in header}
+    return {"identity": source.identity, "samples": header["samples"], "plan": header.get("plan", {}), **known}
 
 
 def _check(sources: Sequence[DataSet], path: Path) -> None:
@@ -74,6 +79,12 @@ def _check(sources: Sequence[DataSet], path: Path) -> None:
                  if plans[0].get(name) != plans[1].get(name)]  # fmt: skip
         if wrong:
             raise DataSetError(f"merge.sources: expected one material, got {where}: {'; '.join(wrong)}.")
+        ramps = [plan.get("ramp", 1) for plan in plans]
+        if ramps[0] != ramps[1]:
+            raise DataSetError(
+                f"merge.sources: expected as many draws of each load path, got {where} with {ramps[1]} and {ramps[0]} "
+                "(samples.ramp); make both with the same."
+            )
         if not np.array_equal(other.response.loaded, first.response.loaded):
             raise DataSetError(f"merge.sources: expected the same loaded nodes, got others in {where}.")
         if other.has_gradients != first.has_gradients or not _alike(other.shapes, first.shapes):

@@ -17,7 +17,7 @@ from ..data.inputs import Change, Inputs
 from ..data.loading import Loading, checked_array
 from ..data.materials import Material, with_parameters
 from ..data.outcome import Equilibrium
-from ..solve.predictor import Adviser, Predictor, check_predictor
+from ..solve.predictor import Adviser, Predictor, check_predictor, knows_material
 from ..solve.problem import Problem
 from .linearisation import Linearisation
 
@@ -47,7 +47,8 @@ class ReferenceModel:
         predictor: proposes where to start when no neighbour is given. Its proposal is weighed against the warped linear
             response, Newton's method goes on from the better one to the same tolerance, and a state that is no minimum
             is not taken: a poor network costs the time of its prediction and changes nothing (after Odot 2023,
-            algorithm 5, which compares residuals).
+            algorithm 5, which compares residuals). It is not asked while the problem has been given another material
+            than it has learned (`Problem.set_material`), as it is not where other `inputs` are given.
         discrepancy: what is not known of the organ, as patterns that the model may be wrong by (see `alternatives`).
 
     Raises:
@@ -67,7 +68,7 @@ class ReferenceModel:
         if predictor is not None:
             check_predictor(predictor, problem)
         self._adviser = None if predictor is None else Adviser(predictor)
-        self._own = problem.material
+        self._own, self._knows_own = problem.material, True
         self._lent: tuple[Inputs, Material] | None = None  # what the problem has been given in place of its own
 
     @property
@@ -111,7 +112,7 @@ class ReferenceModel:
         proposal: Any = None
         if near is not None and guess is None:
             proposal = near.displacement
-        adviser = self._adviser if near is None and inputs is None else None
+        adviser = self._adviser if near is None and inputs is None and self._knows_own else None
         if adviser is not None:
             proposal = adviser.proposal(given)
         found = self.problem.solve(
@@ -140,8 +141,12 @@ class ReferenceModel:
 
     def _look(self) -> None:
         """What the problem has been given by somebody else is its own."""
-        if self._lent is None or self.problem.material is not self._lent[1]:
-            self._own, self._lent = self.problem.material, None
+        here = self.problem.material
+        if self._lent is not None and here is self._lent[1]:
+            return
+        if here is not self._own:
+            self._knows_own = self._adviser is None or knows_material(self._adviser.predictor, here)
+        self._own, self._lent = here, None
 
     def _lend(self, inputs: Inputs, material: Material) -> None:
         self.problem.set_material(material)

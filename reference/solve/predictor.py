@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from softtwin.meshes.body import Body
 
-from ..data.materials import MATERIALS
+from ..data.materials import MATERIALS, Material
 from .problem import Problem
 from .start import Proposal
 
 Floats = NDArray[np.float64]
 _PATIENCE, _LONGEST_PAUSE = 8, 64  # solves
+_PARAMETERS = ("young_modulus", "poisson_ratio")
 
 
 class Predictor(Protocol):
@@ -78,18 +79,23 @@ def check_predictor(predictor: Predictor, problem: Problem) -> None:
             f"predictor: expected a network of this body (fingerprint {problem.body.fingerprint[:12]}...), got one of "
             f"another ({predictor.body.fingerprint[:12]}...)."
         )
+    if not knows_material(predictor, problem.material):
+        learned = predictor.learned_material or {}
+        theirs = {name: learned[name] for name in _PARAMETERS}
+        raise ValueError(
+            f"predictor: expected a network of {problem.material!r}, got one that has learned {learned['material']} "
+            f"with {theirs}; its proposals would lie elsewhere."
+        )
+
+
+def knows_material(predictor: Predictor, material: Material) -> bool:
+    """Whether a predictor has learned equilibria of a material, as far as it says what it has learned."""
     learned = predictor.learned_material
     if learned is None:
-        return
-    expected = MATERIALS.get(learned["material"])
-    theirs = {name: learned[name] for name in ("young_modulus", "poisson_ratio")}
-    here = problem.material
-    same = isinstance(here, expected) if expected is not None else False
-    if not same or any(np.any(getattr(here, name, None) != value) for name, value in theirs.items()):
-        raise ValueError(
-            f"predictor: expected a network of {here!r}, got one that has learned {learned['material']} with {theirs}; "
-            "its proposals would lie elsewhere."
-        )
+        return True
+    law = MATERIALS.get(learned["material"])
+    same = law is not None and isinstance(material, law)
+    return same and not any(np.any(getattr(material, name, None) != learned[name]) for name in _PARAMETERS)
 
 
 def proposal_for(forces: Floats, predictor: Predictor) -> Proposal:

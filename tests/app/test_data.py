@@ -175,6 +175,37 @@ def test_a_draw_in_two_sets_is_refused(first: DataSet, tmp_path: Path) -> None:
     assert not (tmp_path / "both.zarr").exists()
 
 
+def test_draws_of_a_load_path_stay_together_and_apart_from_those_of_other_sets(tmp_path: Path) -> None:
+    """Three draws of two paths lend their second path to no other set, in a set merged from merged ones either."""
+    counts = {"train": 1, "validation": 1, "test": 1}
+    parts = [
+        made(tmp_path / str(seed), seed=seed, ramp=2, samples={**counts, "calibration": count})
+        for seed, count in enumerate((3, 4, 3))
+    ]
+    both = merge(parts[:2], tmp_path / "both.zarr")
+    whole = merge([both, parts[2]], tmp_path / "whole.zarr")
+    held = whole.samples("calibration")
+    loads = held.forces.reshape(len(held), -1)
+    ways = loads / np.linalg.norm(loads, axis=1)[:, None]
+    is_one_path = np.abs(ways @ ways.T - 1.0) < 1e-12  # sizes of one load
+    paths = whole.load_paths("calibration", held.draws)
+    assert len(held) == 10 and len(np.unique(paths)) == 6
+    np.testing.assert_array_equal(paths[:, None] == paths[None], is_one_path)
+    first = parts[0].samples("calibration")
+    assert parts[0].load_paths("calibration", first.draws).tolist() == [0, 0, 1]
+    assert len(np.unique(whole.load_paths("train", whole.samples("train").draws))) == 3
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_sets_with_other_numbers_of_draws_a_path_are_refused(tmp_path: Path, order: int) -> None:
+    """Merged, the sixteen draws of two paths would pass for as many paths, and bounds be the narrower for it."""
+    counts = {"train": 1, "validation": 1, "test": 1}
+    singly = made(tmp_path / "singly", samples={**counts, "calibration": 12})
+    ramps = made(tmp_path / "ramps", seed=1, ramp=8, block=8, samples={**counts, "calibration": 16})
+    with pytest.raises(DataSetError, match=r"as many draws of each load path, got .* with \d and \d \(samples\.ramp\)"):
+        merge([singly, ramps][::order], tmp_path / "both.zarr")
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -130,6 +130,7 @@ def test_the_hybrid_engine_is_nearer_and_surer_than_the_network(copy: Path, caps
     assert softtwin("report", copy / "organ.toml") == 0
     page = (copy / "report.html").read_text()
     assert "with the hybrid engine" in page and "reference and network apart" in page and "95 % margin" in page
+    assert "network off, mean (mm)" in page and "certificate: " in page
     assert "tumour moved" in capsys.readouterr().out
 
 

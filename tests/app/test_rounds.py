@@ -24,6 +24,7 @@ from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import NEEDED, DataSet, DataSetError, drop_block, write_chosen
 from softtwin.reference.data.jacobians import missing_jacobians, read_jacobians
 from softtwin.reference.data.merge import merge
+from softtwin.reference.data.part import Part
 from softtwin.reference.data.summary import summary
 from softtwin.reference.generate import candidate_loads, plan_from_header, ramp_loads, solve_block
 from softtwin.surrogate.acquisition import most_telling, spread_out
@@ -214,6 +215,32 @@ def test_a_start_from_a_network_ends_in_the_same_states(copied: Workspace) -> No
     np.testing.assert_array_equal(after["reason"], before["reason"])
 
 
+@pytest.mark.parametrize("part", [None, Part(0, 1)], ids=["whole", "part"])
+def test_the_stage_asks_the_network_of_its_round(
+    copied: Workspace, monkeypatch: pytest.MonkeyPatch, part: Part | None
+) -> None:
+    """For each draw of a round that is solved, and for no other; each asked network is that of its round."""
+    data, asked = DataSet(copied.data), []
+    own = [load(copied.data.parent / "rounds" / str(number), data.body).card["training"] for number in (1, 2)]
+    propose = Surrogate.propose
+
+    def counted(self: Surrogate, *arguments: object) -> np.ndarray:
+        asked.append(own.index(self.card["training"]))
+        return propose(self, *arguments)
+
+    monkeypatch.setattr(Surrogate, "propose", counted)
+    first = data.split_draws("active").start
+    dropped = data.rows(range(first, first + 2)), data.rows(range(first + 4, first + 6))
+    for block in (0, first // 2, first // 2 + 2):
+        drop_block(copied.data, block)
+    generate_stage(copied.root / "organ.toml", part=part)
+    assert asked == [0, 0, 1, 1]
+    again = DataSet(copied.data)
+    assert again.missing_blocks() == []
+    for place, before in zip((first, first + 4), dropped, strict=True):
+        np.testing.assert_array_equal(again.rows(range(place, place + 2))["displacements"], before["displacements"])
+
+
 def test_a_block_whose_network_is_lost_is_solved_from_rest_and_that_is_said(copied: Workspace) -> None:
     data = DataSet(copied.data)
     draws = data.split_draws("active")
@@ -263,6 +290,17 @@ def test_rounds_without_torch_say_what_is_missing(copied: Workspace, monkeypatch
     monkeypatch.setitem(sys.modules, "softtwin.surrogate.train", None)
     with pytest.raises(ConfigError, match=r"samples\.rounds: expected torch for the networks that choose draws"):
         generate_stage(copied.root / "organ.toml")
+
+
+def test_a_part_without_torch_says_what_it_does(copied: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "softtwin.app.stages.rounds")
+    monkeypatch.delattr("softtwin.app.stages.rounds")
+    monkeypatch.setitem(sys.modules, "softtwin.surrogate.train", None)
+    data = DataSet(copied.data)
+    drop_block(copied.data, data.split_draws("active").start // 2)
+    with pytest.warns(UserWarning, match=r"part 0/1: samples\.rounds: expected torch .* are solved from rest"):
+        made = generate_stage(copied.root / "organ.toml", part=Part(0, 1))
+    assert made is not None and made.missing_blocks() == []
 
 
 @pytest.mark.mpi

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,8 @@ import own_forward_model
 import own_simulator
 import pytest
 import register_a_cloud
+
+from softtwin.reference.data.dataset import DataSet
 
 EXAMPLES = {
     "register_a_cloud",
@@ -74,6 +77,7 @@ def test_run_exported_graphs(small_quickstart: Path, tmp_path: Path, capsys) -> 
     assert "graphs written to" in capsys.readouterr().out
 
 
+SCRIPT = Path(own_forward_model.__file__).parent / "slurm.sh"
 SMALL = """
 folder = "."
 [body]
@@ -89,22 +93,52 @@ jacobians = false
 
 @pytest.mark.fenicsx
 def test_an_array_of_jobs_under_plain_bash(tmp_path: Path) -> None:
-    """Two of three tasks at the same moment; the third is lost, which is told, and made by `generate`."""
+    """Two of three tasks at the same moment; the third is lost, which is told, and made alone as an array of one.
+
+    SLURM says then that the array has one task, and its number.
+    """
     pytest.importorskip("petsc4py", reason="FEniCSx is absent")
-    script = Path(own_forward_model.__file__).parent / "slurm.sh"
     organ = tmp_path / "organ.toml"
     organ.write_text(SMALL)
     bare = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
-    environment = bare | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "SLURM_ARRAY_TASK_COUNT": "3"}
+    environment = bare | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "SOFTTWIN_PARTS": "3"}
 
     def run(*command: str, **more: str) -> subprocess.Popen:
         return subprocess.Popen(command, env=environment | more, stdout=subprocess.PIPE, text=True)
 
     mesh = run("softtwin", "mesh", str(organ))
     assert "nodes" in mesh.communicate(timeout=120)[0] and mesh.returncode == 0
-    tasks = [run("bash", str(script), str(organ), SLURM_ARRAY_TASK_ID=str(number)) for number in (0, 2)]
-    said = [task.communicate(timeout=120)[0] for task in tasks]
-    assert [task.returncode for task in tasks] == [0, 0]
+
+    def task(number: int, of: int) -> subprocess.Popen:
+        told = {"SLURM_ARRAY_TASK_ID": str(number), "SLURM_ARRAY_TASK_COUNT": str(of)}
+        return run("bash", str(SCRIPT), str(organ), **told)
+
+    tasks = [task(number, 3) for number in (0, 2)]
+    said = [each.communicate(timeout=120)[0] for each in tasks]
+    assert [each.returncode for each in tasks] == [0, 0]
     assert any("2 of 5 blocks of" in each and "are still missing" in each for each in said)
+    again = task(1, 1)
+    again.communicate(timeout=120)
+    assert again.returncode == 0 and DataSet(tmp_path / "data.zarr").missing_blocks() == []
     whole = run("softtwin", "generate", str(organ))
     assert "20 equilibria accepted, 0 rejected" in whole.communicate(timeout=120)[0]
+
+
+def test_the_array_has_as_many_tasks_as_the_script_has_parts(tmp_path: Path) -> None:
+    """The header and the script each say it; outside of an array there is one part."""
+    (last,) = re.findall(r"^#SBATCH --array=0-(\d+)$", SCRIPT.read_text(), flags=re.M)
+    fake = tmp_path / "softtwin"
+    fake.write_text('#!/usr/bin/env bash\necho "$@"\n')
+    fake.chmod(0o755)
+    bare = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM_", "SOFTTWIN_"))}
+    environment = bare | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+
+    def parts(**more: str) -> str:
+        command = ["bash", str(SCRIPT), "organ.toml"]
+        return subprocess.run(
+            command, env=environment | more, capture_output=True, text=True, check=True
+        ).stdout.split()[-1]
+
+    assert parts(SLURM_ARRAY_TASK_ID=last) == f"{last}/{int(last) + 1}"
+    assert parts(SLURM_ARRAY_TASK_ID="3", SLURM_ARRAY_TASK_COUNT="1", SOFTTWIN_PARTS="8") == "3/8"
+    assert parts() == parts(SOFTTWIN_PARTS="8") == "0/1"

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data import dataset
-from softtwin.reference.data.dataset import SPLITS, DataSet, DataSetError, drop_block, probe_cotangents
+from softtwin.reference.data.dataset import SPLITS, DataSet, DataSetError, Split, drop_block, probe_cotangents
 from softtwin.reference.data.part import Part, at_work_on
 from softtwin.reference.data.samplers import LoadPlan, QuasiRandom, sobol_point
 from softtwin.reference.generate import DamagedBlock, Plan, generate, linear_response, solve_block
@@ -104,11 +105,14 @@ def test_samples_are_equilibria_with_their_adjoints(undisturbed: DataSet) -> Non
             np.testing.assert_allclose(adjoint, again, rtol=1e-9, atol=1e-12)
 
 
-def test_splits_share_no_draw(undisturbed: DataSet) -> None:
-    draws = [set(undisturbed.split_draws(split)) for split in SPLITS]
-    assert not (draws[0] & draws[1] or draws[1] & draws[2] or draws[0] & draws[2])
-    blocks = [{draw // PLAN.block for draw in split} for split in draws]
-    assert not (blocks[0] & blocks[1] or blocks[1] & blocks[2] or blocks[0] & blocks[2])
+@pytest.mark.parametrize(("one", "other"), list(combinations(PLAN.samples, 2)))
+def test_splits_share_no_draw(undisturbed: DataSet, one: Split, other: Split) -> None:
+    """Neither numbers nor blocks nor loads, those of the calibration included."""
+    draws = [set(undisturbed.split_draws(split)) for split in (one, other)]
+    blocks = [{draw // PLAN.block for draw in each} for each in draws]
+    loads = [{forces.tobytes() for forces in undisturbed.samples(split).forces} for split in (one, other)]
+    for first, second in (draws, blocks, loads):
+        assert first and second and not first & second
 
 
 @pytest.mark.mpi

@@ -14,6 +14,7 @@ pytest.importorskip("torch", reason="torch is absent")
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.inputs import Inputs
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.derivatives.model import ReferenceModel
@@ -54,11 +55,11 @@ def held_out(data: DataSet) -> Iterator[np.ndarray]:
 
 
 def stepped(problem: Problem, load: np.ndarray) -> np.ndarray:
-    """The state that 20 load steps lead to."""
-    state = None
+    """The state that 20 careful load steps lead to: each from the displacement before, and from nowhere else."""
+    reached = np.zeros_like(load)
     for part in np.linspace(0.05, 1.0, 20):
-        state = problem.solve(part * load, state)
-    return state.displacement
+        reached = problem.solve(part * load, reached, fallback=False).displacement
+    return reached
 
 
 def with_random_weights(network: Surrogate) -> Surrogate:
@@ -94,6 +95,18 @@ def test_random_weights_change_no_state_and_no_iteration(problem: Problem, netwo
         np.testing.assert_array_equal(found.displacement, plain.displacement)
         assert found.equilibrium.iterations == plain.equilibrium.iterations
         assert found.equilibrium.start == "linear response"
+
+
+@pytest.mark.parametrize("size", [1.0, 1.5, 2.0])
+def test_random_weights_lead_to_the_states_of_careful_load_steps(
+    problem: Problem, network: Surrogate, data: DataSet, size: float
+) -> None:
+    """Beyond the range, too, where what they propose is at times of less energy than the linear response."""
+    model = ReferenceModel(problem, predictor=with_random_weights(network))
+    for load in held_out(data):
+        found = model.solve(size * load)
+        largest = np.abs(found.displacement).max()
+        np.testing.assert_allclose(found.displacement, stepped(problem, size * load), atol=1e-6 * largest)
 
 
 class Counted:
@@ -162,17 +175,26 @@ def test_a_load_where_the_network_has_never_seen_one_is_solved_without_it(data: 
     assert found.equilibrium.start == "linear response" and found.equilibrium.residual < 1e-9
 
 
-def test_a_proposal_that_is_no_minimum_is_given_up() -> None:
-    """A column pressed beyond its buckling load may stand straight in balance."""
+@pytest.mark.parametrize(("sideways", "pivots"), [(1e-3, 0), (0.0, 2)], ids=["pushed", "symmetric"])
+def test_a_proposal_that_is_no_minimum_is_given_up(sideways: float, pivots: int) -> None:
+    """A column pressed beyond its buckling load may stand straight in balance; pushed a little it bends.
+
+    Symmetric, every start without a proposal stands straight, too, as careful load steps do: that is the state then,
+    and it says that it is unstable.
+    """
     column = beam((8, 1, 1), (1.0, 0.1, 0.1), "hexahedron")
     tip, load = column.node_sets["tip"], np.zeros_like(column.points)
-    load[tip] = [-0.5 / len(tip), 0.0, 0.0]
+    load[tip] = [-0.5 / len(tip), 0.0, sideways / len(tip)]
     with Problem(column, NeoHookean(5000.0, 0.3), NewtonOptions(search="full")) as problem:
-        straight = problem.solve(load)
-    assert straight.negative_pivots is not None and straight.negative_pivots > 0
+        straight = problem.solve(load, np.zeros_like(load), fallback=False)
+    assert straight.negative_pivots == 2  # it bends either way
     with Problem(column, NeoHookean(5000.0, 0.3)) as problem:
-        found = problem.solve(load, proposal=straight.displacement)
-    assert found.start != "proposal"
+        found, plain = problem.solve(load, proposal=straight.displacement), problem.solve(load)
+    assert found.start == plain.start != "proposal" and found.negative_pivots == pivots
+    largest = np.abs(plain.displacement).max()
+    np.testing.assert_allclose(found.displacement, plain.displacement, atol=1e-6 * largest)
+    if pivots == 0:
+        assert found.energy < 10.0 * straight.energy and np.abs(found.displacement[tip, 2]).min() > 0.5
 
 
 def test_a_proposal_takes_the_linear_response_that_is_known(
@@ -198,3 +220,24 @@ def test_a_network_of_another_material_is_refused(data: DataSet, network: Surrog
     refused = pytest.raises(ValueError, match=r"predictor: expected a network of NeoHookean.*got one that has learned")
     with Problem(data.body, NeoHookean(5000.0, 0.4)) as problem, refused:
         ReferenceModel(problem, predictor=network)
+
+
+def test_a_network_is_not_asked_while_the_problem_has_another_material(data: DataSet, network: Surrogate) -> None:
+    """Given after the model was made; asked again when the problem has its own back, or an equal one."""
+    load, counted = next(held_out(data)), Counted(network)
+    softer = NeoHookean(4000.0, PLAN.poisson_ratio)
+    with Problem(data.body, PLAN.build_material()) as problem, Problem(data.body, softer) as other:
+        model = ReferenceModel(problem, predictor=counted)
+        model.solve(load)
+        assert counted.asked == 1
+        problem.set_material(softer)
+        found, expected = model.solve(load), other.solve(load)
+        assert counted.asked == 1 and found.equilibrium.start == "linear response"
+        largest = np.abs(expected.displacement).max()
+        np.testing.assert_allclose(found.displacement, expected.displacement, atol=1e-6 * largest)
+        model.solve(load, inputs=Inputs({"young_modulus": 4500.0}))
+        model.solve(load)  # the softer one again, which inputs had taken the place of
+        assert counted.asked == 1 and problem.material is softer
+        problem.set_material(PLAN.build_material())
+        model.solve(load)
+        assert counted.asked == 2

@@ -18,7 +18,8 @@ TEXT = (Path(__file__).parents[2] / "docs" / "surrogates.md").read_text()
 
 
 def test_the_guide_runs(data: DataSet, closed_form: Any, tmp_path: Path, capsys, monkeypatch) -> None:
-    plan = {**data.header["plan"], "material": "neo-hookean", "young_modulus": 20.0, "poisson_ratio": 0.4}
+    known = {"material": "neo-hookean", "young_modulus": 20.0, "poisson_ratio": 0.4, "loads": {"kind": "modal"}}
+    plan = {**data.header["plan"], **known}
     monkeypatch.setitem(data.header, "plan", plan)
     forces = np.zeros((30, *data.body.points.shape))
     forces[:, data.response.loaded] = np.resize(data.samples("train").forces, (30, len(data.response.loaded), 3))

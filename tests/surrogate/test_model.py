@@ -130,13 +130,29 @@ def test_a_reduced_surrogate_takes_combinations_of_its_basis(surrogate: Surrogat
 def test_extent_is_one_at_the_farthest_load_of_the_training(reduced: Surrogate, data: DataSet) -> None:
     assert reduced.solve(np.zeros_like(reduced.body.points)).extent is None
     known = with_domain(reduced, data)
-    extents = []
+    extents, distances = [], []
     for loads in data.samples("train").forces:
         forces = np.zeros_like(known.body.points)
         forces[data.response.loaded] = loads
         extents.append(known.solve(forces).extent)
+        distances.append(known.solve(forces).distance)
     assert max(extents) == pytest.approx(1.0, abs=0.2) and min(extents) < 0.9
+    assert max(distances) == pytest.approx(1.0) and min(distances) < 0.9
     assert known.solve(3.0 * forces).extent > 2.0 * known.solve(forces).extent
+    assert known.solve(3.0 * forces).distance == pytest.approx(3.0 * known.solve(forces).distance)
+
+
+def test_a_state_says_whether_its_load_was_learned(reduced: Surrogate, data: DataSet, forces: np.ndarray) -> None:
+    """By its distance, which knows no displacement, or by how far it moves the body."""
+    assert reduced.solve(forces).is_inside is None is reduced.solve(forces).distance
+    known = with_domain(reduced, data)
+    domain, state = known.card["domain"], known.solve(forces)
+    assert state.is_inside == (state.extent <= 1.0)
+    far = known.solve(1.5 / state.distance * forces)
+    assert far.distance == pytest.approx(1.5) and far.is_inside is False
+    largest = np.linalg.norm(state.displacement, axis=1).max()
+    stiff = known.with_card(domain={**domain, "displacement_m": largest / 2.0}).solve(forces)
+    assert stiff.distance == state.distance < 1.0 and stiff.extent == pytest.approx(2.0) and stiff.is_inside is False
 
 
 def test_forces_where_none_were_trained_are_refused_by_name(surrogate: Surrogate) -> None:

@@ -249,9 +249,11 @@ def test_the_learning_rate_follows_the_budget_that_was_used() -> None:
     assert rate_factor(1, 0.5) == pytest.approx(0.5)  # a slow machine is past the warm-up in the middle of its time
 
 
-def test_held_out_samples_are_never_read(data: DataSet, make_data: Any, short: TrainingPlan) -> None:
-    poisoned = make_data(poison="test")
-    assert np.isnan(poisoned.samples("test").displacements).all()
+@pytest.mark.parametrize("split", ["test", "calibration"])
+def test_held_out_samples_are_never_read(data: DataSet, make_data: Any, short: TrainingPlan, split: Any) -> None:
+    poisoned = make_data(poison=split)
+    held = poisoned.samples(split).displacements
+    assert len(held) and np.isnan(held).all()
     assert _same(train(poisoned, short), train(data, short))
 
 
