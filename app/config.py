@@ -181,7 +181,12 @@ class TrainingSection(_Section):
     seconds: Positive = Field(
         120.0, description="wall time to train: ends with the step under way; reading the data not counted"
     )
-    epochs: int = Field(0, ge=0, description="passes over the samples instead, whatever time they take; 0: by seconds")
+    epochs: int = Field(
+        0,
+        ge=0,
+        description="passes over the samples (reduced network: and their symmetric images) instead, whatever time they "
+        "take; 0: by seconds",
+    )
     seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
     precision: Literal["single", "mixed"] = Field(
         "single", description="mixed: products in bfloat16, for large networks on a GPU"

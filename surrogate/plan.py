@@ -23,7 +23,9 @@ class TrainingPlan:
         seconds: wall time of the steps, the looks at the validation split and the checkpoints together. The clock is
             looked at before every step, so that training ends with the step that is under way when the time is over,
             on a busy machine too (with fewer steps then). Reading the data and finding the modes come before it.
-        epochs: passes over the training samples; given, it replaces `seconds`.
+        epochs: passes over all that a network learns from: the training samples and, of a reduced network, their
+            symmetric images, of which one pass is as many over the samples as the body has symmetries. Given, it
+            replaces `seconds`.
         batch: samples a step; None for the architecture's own.
         learning_rate: highest of the cosine; None for the architecture's own.
         samples: draws of the training split to use; None for all.

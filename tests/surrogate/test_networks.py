@@ -22,7 +22,7 @@ SETTINGS: dict[str, Architecture] = {
     "reduced": Reduced(modes=6, width=24, depth=2),
     "reduced, no symmetries": Reduced(modes=6, width=24, depth=2, symmetries=False),
     "mlp": Perceptron(),
-    "mlp, 20 wide": Perceptron(width=20),
+    "mlp, 20 wide, tanh": Perceptron(width=20, activation="tanh"),
     "transolver": Transolver(width=16, depth=2, heads=2, slices=4),
     "umesh": UMesh(channels=4, levels=2),
     "umesh, numbered along the long axis": UMesh(channels=4, levels=1, numbering="long"),

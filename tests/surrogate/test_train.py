@@ -353,6 +353,7 @@ def test_plans_out_of_range_are_refused(change: dict[str, Any], message: str) ->
         (lambda: Reduced(modes=0), r"Reduced\.modes: expected at least 1, got 0"),
         (lambda: Reduced(sobolev=-0.1), r"Reduced\.sobolev: expected a number not below 0"),
         (lambda: Perceptron(width=0), r"Perceptron\.width: expected at least 1, got 0"),
+        (lambda: Perceptron(activation="swish"), r"Perceptron\.activation: expected one of relu, .*, got 'swish'"),
         (lambda: Transolver(heads=0), r"Transolver\.heads: expected at least 1, got 0"),
         (lambda: Transolver(width=65), r"Transolver\.width: expected a multiple of 4 heads, got 65"),
     ],
