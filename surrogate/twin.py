@@ -100,7 +100,9 @@ def _revived(folder: Path, architecture: str, weights: dict[str, torch.Tensor]) 
     try:
         return ARCHITECTURES[architecture].revived(weights)
     except ValueError as error:
-        raise TwinError(f"load.folder: the network in {folder} is of a newer version of this program: {error}") from error
+        raise TwinError(
+            f"load.folder: the network in {folder} is of a newer version of this program: {error}"
+        ) from error
 
 
 def _read_card(path: Path) -> dict[str, Any]:
