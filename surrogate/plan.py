@@ -35,7 +35,8 @@ class TrainingPlan:
         precision: `single`, or `mixed`: products of matrices in bfloat16, which has three digits; it suits large
             networks on a GPU, and not one that is to be right to a thousandth.
         device: where to train; `auto` takes a GPU where torch sees one.
-        processes: that share each batch, on a GPU each, or on the cores of one machine.
+        processes: that share each batch, on a GPU each, or on the cores of one machine. They learn what one would, from
+            whole Jacobians in the mean: each process draws directions of its own.
 
     Raises:
         ValueError: an argument out of its range.
