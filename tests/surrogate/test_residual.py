@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import (
     Energy,
@@ -32,6 +33,8 @@ KINDS = ["tetrahedron", "hexahedron"]
 
 
 def body_of(kind: str, degree: int = 1, curved: bool = False) -> Body:
+    if kind == "gridded":  # hexahedra whose cut cells count with their filled part
+        return gridded(beam((3, 2, 2), (1.0, 0.25, 0.25), "tetrahedron"), 0.11)
     made = beam((3, 2, 2), (1.0, 0.25, 0.25), "tetrahedron" if kind == "tetrahedron" else "hexahedron")
     made = made.quadratic() if degree == 2 else made
     points = made.points + 0.01 * np.sin(7.0 * made.points[:, [1, 2, 0]]) if curved else made.points
@@ -49,23 +52,31 @@ def batch(*fields: np.ndarray) -> Tensor:
 @pytest.mark.fenicsx
 @pytest.mark.parametrize("law", LAWS.values(), ids=list(LAWS))
 @pytest.mark.parametrize(
-    ("kind", "degree", "curved"), [(k, d, c) for k in KINDS for d, c in ((1, False), (2, False), (2, True))]
+    ("kind", "degree", "curved"),
+    [(k, d, c) for k in KINDS for d, c in ((1, False), (2, False), (2, True))] + [("gridded", 1, False)],
 )
-def test_energy_and_forces_are_the_references(law: Material, kind: str, degree: int, curved: bool, rng) -> None:
+def test_energy_forces_and_residual_are_the_references(
+    law: Material, kind: str, degree: int, curved: bool, rng
+) -> None:
     from softtwin.reference.solve.problem import Problem
 
     body = body_of(kind, degree, curved)
-    weights = rng.uniform(0.3, 1.0, len(body.cells))
+    weights = None if kind == "gridded" else rng.uniform(0.3, 1.0, len(body.cells))
+    assert (kind == "gridded") == (body.fractions is not None and body.fractions.min() < 0.9)
     fields = [some_displacement(body, rng) for _ in range(2)]
     physics = ElasticBody(body, law, weights)
     energies, forces = physics.energy(batch(*fields)).numpy(), physics.internal_forces(batch(*fields)).numpy()
+    loads = [np.abs(forces).max() * rng.standard_normal(body.points.shape) for _ in fields]
+    residuals = physics.residual(batch(*fields), batch(*loads)).numpy()
     with Problem(body, law, weights=weights) as problem:
         stiffness = problem.stiffness(fields[0])
         free = np.repeat(np.isin(np.arange(len(body.points)), body.free), 3)
         found = physics.stiffness(torch.from_numpy(fields[0]))[free][:, free]
         assert abs(found - stiffness[free][:, free]).max() < 1e-10 * abs(stiffness).max()
-        for field, energy, force in zip(fields, energies, forces, strict=True):
+        for field, load, energy, force, residual in zip(fields, loads, energies, forces, residuals, strict=True):
             expected = problem.internal_forces(field)
+            missing = (expected - load)[body.free]
+            assert residual == pytest.approx(np.linalg.norm(missing) / np.linalg.norm(load[body.free]), rel=1e-10)
             assert energy == pytest.approx(problem.energy(field), rel=1e-10)
             np.testing.assert_allclose(force, expected, atol=1e-10 * np.abs(expected).max())
 
