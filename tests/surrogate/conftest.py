@@ -131,6 +131,12 @@ def data(small_beam: Body, tmp_path_factory: pytest.TempPathFactory) -> DataSet:
     return write_data_set(tmp_path_factory.mktemp("closed") / "data.zarr", small_beam)
 
 
+@pytest.fixture(scope="session")
+def write_data() -> Maker:
+    """For bodies of a test's own."""
+    return write_data_set
+
+
 @pytest.fixture
 def soft(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> DataSet:
     same = DataSet(data.path)

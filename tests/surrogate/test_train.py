@@ -25,6 +25,7 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.precision import without_tf32
 from softtwin.surrogate.reduced import Reduced
+from softtwin.surrogate.registry import ARCHITECTURES
 from softtwin.surrogate.train import train
 from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
@@ -183,12 +184,27 @@ def test_single_precision_is_without_tf32(
         assert torch.backends.cuda.matmul.allow_tf32 and torch.backends.cudnn.allow_tf32
 
 
-@pytest.mark.parametrize("budget", ["epochs", "seconds"])
+STOPPED: dict[str, Architecture | None] = {
+    "reduced": None,
+    "mlp": Perceptron(16, "tanh"),
+    "umesh": UMesh(channels=2, levels=1),
+    "transolver": Transolver(width=8, depth=1, heads=2, slices=4),
+}
+
+
+def test_every_architecture_is_stopped_here() -> None:
+    assert set(STOPPED) == set(ARCHITECTURES)
+
+
+@pytest.mark.parametrize(("kind", "budget"), [("reduced", "seconds"), *((kind, "epochs") for kind in STOPPED)])
 def test_training_goes_on_as_if_never_stopped(
-    data: DataSet, short: TrainingPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, budget: str
+    data: DataSet, short: TrainingPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, budget: str
 ) -> None:
+    short = replace(short, architecture=STOPPED[kind] or short.architecture)
     if budget == "seconds":
         short = replace(short, epochs=None, seconds=8.0)
+    elif kind != "reduced":
+        short = replace(short, epochs=4)  # at least a step in each of the eight rounds, without images
     whole = train(data, short, tmp_path / "whole", Ticking(0.125))
 
     def crash() -> None:
