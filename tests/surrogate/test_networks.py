@@ -85,6 +85,18 @@ def test_derivatives_are_those_of_differences(network: Network, point: torch.Ten
     assert ((ahead - behind) / (2.0 * step) - pushed).abs().max() < 1e-7 * pushed.abs().max()
 
 
+def test_pulled_gradients_are_those_of_differences(network: Network, point: torch.Tensor) -> None:
+    """Along the gradient itself, where its size is what differences say, and across it."""
+    step, size = 1e-6, float(point.abs().max())
+    cotangent = _drawn(len(network.linearised(point).values))
+    pulled = network.linearised(point).pull(cotangent)
+    across = _drawn(len(point))
+    for way in (pulled / torch.linalg.vector_norm(pulled), across / torch.linalg.vector_norm(across)):
+        ahead, behind = (network((point + sign * step * size * way)[None])[0] for sign in (1.0, -1.0))
+        found = float((ahead - behind) @ cotangent) / (2.0 * step * size)
+        assert abs(found - float(pulled @ way)) < 1e-7 * float(torch.linalg.vector_norm(pulled))
+
+
 def test_a_batch_is_its_points(network: Network, point: torch.Tensor) -> None:
     batch = torch.stack([point, -0.5 * point, 0.1 * point])
     apart = torch.stack([network.linearised(each).values for each in batch])

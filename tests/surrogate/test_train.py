@@ -18,7 +18,7 @@ from softtwin.reference.data.dataset import DataSet, DataSetError, drop_block
 from softtwin.surrogate import course as training
 from softtwin.surrogate.architecture import Architecture
 from softtwin.surrogate.checkpoint import CHECKPOINT, VERSION, CheckpointError
-from softtwin.surrogate.course import Course, Diverged, fit, rate_factor
+from softtwin.surrogate.course import Course, Diverged, chosen_device, fit, rate_factor
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
@@ -282,10 +282,11 @@ def test_held_out_samples_are_never_read(data: DataSet, make_data: Any, short: T
     assert _same(train(poisoned, short), train(data, short))
 
 
-def test_poisoned_training_data_is_noticed(make_data: Any, short: TrainingPlan) -> None:
+@pytest.mark.parametrize("split", ["train", "validation"])
+def test_poisoned_data_are_noticed(make_data: Any, short: TrainingPlan, split: str) -> None:
     """What makes the test above mean something: NaN that is read does not pass unseen."""
-    with pytest.raises(ValueError, match=r"expected finite numbers in the train split .* got \d+ of \d+ samples"):
-        train(make_data(poison="train"), short)
+    with pytest.raises(ValueError, match=rf"expected finite numbers in the {split} split .* got \d+ of \d+ samples"):
+        train(make_data(poison=split), short)
 
 
 @pytest.mark.parametrize("split", ["train", "validation"])
@@ -408,6 +409,19 @@ def test_training_that_gets_no_better_ends_early(
     assert min(errors) == short.card["training"]["validation_error"]
     assert len(errors) - 1 - int(np.argmin(errors)) == 3
     assert all(float(line["loss"]) > 0.0 for line in lines)
+
+
+@pytest.mark.parametrize("device", ["auto", "cuda"])
+def test_more_processes_than_gpus_are_refused(
+    data: DataSet, short: TrainingPlan, monkeypatch: pytest.MonkeyPatch, device: Any
+) -> None:
+    """Before anything is trained; on the CPU there may be as many as one likes."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    plan = replace(short, processes=2, device=device)
+    with pytest.raises(ValueError, match=r"TrainingPlan\.processes: expected at most one for each of 1 GPUs, got 2"):
+        train(data, plan)
+    assert chosen_device(replace(plan, device="cpu")) == "cpu"
 
 
 @pytest.mark.parametrize(("setting", "value"), [("patience", 0), ("device", "tpu")])
