@@ -10,8 +10,9 @@ from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.fast import FastSurrogate, Precision
 from softtwin.surrogate.model import Surrogate
 
+from .conftest import DEVICES
+
 CLOSE = {"single": 1e-6, "double": 1e-12}  # of the largest
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 
 
 @pytest.fixture(params=CLOSE)

@@ -22,6 +22,8 @@ from softtwin.reference.data.materials import (
 )
 from softtwin.surrogate.residual import ElasticBody
 
+from .conftest import DEVICES
+
 LAWS: dict[str, Material] = {
     "linear": LinearElastic(4500.0, 0.3),
     "Saint-Venant-Kirchhoff": SaintVenantKirchhoff(4500.0, 0.45),
@@ -43,6 +45,10 @@ def body_of(kind: str, degree: int = 1, curved: bool = False) -> Body:
 
 def some_displacement(body: Body, rng: np.random.Generator, size: float = 0.02) -> np.ndarray:
     return size * np.sin(5.0 * body.points @ rng.standard_normal((3, 3)))
+
+
+def only(fields: Tensor, i: int) -> Tensor:
+    return fields[i : i + 1]
 
 
 def batch(*fields: np.ndarray) -> Tensor:
@@ -132,6 +138,26 @@ def test_a_rigid_motion_costs_nothing_but_in_the_linear_law(law: Material) -> No
     energies = ElasticBody(body, law).energy(batch(np.zeros_like(moved), np.full_like(moved, 0.3), moved)).numpy()
     np.testing.assert_allclose(energies[:2], 0.0, atol=1e-10)
     assert (abs(energies[2]) > 1.0) == isinstance(law, LinearElastic)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_batch_on_any_device_is_its_samples_on_the_cpu(device: str, rng) -> None:
+    body = body_of("hexahedron")
+    u = batch(*(some_displacement(body, rng) for _ in range(3)))
+    b = batch(*(rng.standard_normal(body.points.shape) for _ in range(3)))
+    alone, physics = (ElasticBody(body, LAWS["Neo-Hookean"]) for _ in range(2))
+    physics = physics.to(device)
+    sent = u.to(device), b.to(device)
+    for found, one in (
+        (physics.energy(sent[0]), lambda i: alone.energy(only(u, i))),
+        (physics.internal_forces(sent[0]), lambda i: alone.internal_forces(only(u, i))),
+        (physics.residual(*sent), lambda i: alone.residual(only(u, i), only(b, i))),
+    ):
+        assert found.device.type == device
+        expected = torch.cat([one(i) for i in range(3)])
+        assert (found.cpu() - expected).abs().max() < 1e-12 * expected.abs().max()
+    stiffness = alone.stiffness(u[0])
+    assert abs(physics.stiffness(sent[0][0]) - stiffness).max() < 1e-12 * abs(stiffness).max()
 
 
 def test_a_cell_inside_out_shows(rng) -> None:

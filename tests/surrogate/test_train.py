@@ -22,6 +22,7 @@ from softtwin.surrogate.course import Course, Diverged, chosen_device, fit, rate
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.physics import Physics
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.precision import without_tf32
 from softtwin.surrogate.reduced import Reduced
@@ -29,6 +30,8 @@ from softtwin.surrogate.registry import ARCHITECTURES
 from softtwin.surrogate.train import train
 from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
+
+from .conftest import DEVICES
 
 
 @pytest.fixture(autouse=True)
@@ -156,6 +159,19 @@ def test_the_clock_of_the_first_process_ends_all(
     plan = TrainingPlan(Reduced(modes=8, width=16), seconds=1.5)
     one, two = (train(data, replace(plan, processes=each), clock=made()) for each in (1, 2))
     assert two.card["training"]["steps"] == one.card["training"]["steps"] > 40
+
+
+@pytest.mark.parametrize("physics", [None, Physics(energy=1e-3)], ids=["data", "data and energy"])
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_short_training_on_any_device_learns_and_says_where(soft: DataSet, device: Any, physics: Any) -> None:
+    plan = TrainingPlan(Reduced(modes=6, width=32, depth=2), batch=32, epochs=10, physics=physics, device=device)
+    surrogate = train(soft, plan)
+    assert surrogate.card["training"]["device"] == device
+    assert all(weights.dtype == torch.float64 and weights.is_cpu for weights in surrogate.network.parameters())
+    samples = soft.samples("test")
+    linear = soft.response.apply(samples.forces) - samples.displacements
+    missed = np.linalg.norm(linear, axis=(1, 2)) / np.linalg.norm(samples.displacements, axis=(1, 2))
+    assert evaluate(surrogate, soft).relative_error.median < 0.5 * np.median(missed)
 
 
 def test_mixed_precision_learns_too(data: DataSet) -> None:
