@@ -15,7 +15,7 @@ import click
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.attachment import File, parse_file, parse_regions
-from softtwin.meshes.files import Unit, stated_frame
+from softtwin.meshes.files import Unit, stated_axes
 from softtwin.reference.ranks import FailedElsewhere
 
 from .config import LAWS, Config, ConfigError, parse_config, to_toml
@@ -309,7 +309,7 @@ def register(
 
     Every frame has a verdict: accepted, doubtful or refused, with reasons. Written to the folder: registration.json,
     and for each frame the organ with displacement and force (VTU) and the moved surface of each structure, in the
-    unit and frame of the organ's files; frames.pvd opens all of it in ParaView.
+    unit and on the axes of the organ's files; frames.pvd opens all of it in ParaView.
 
     TWIN is a twin's folder; with --model reference a folder with a body and its configuration is enough.
     """
@@ -426,7 +426,7 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 @click.option(
     "--frame",
     type=click.Choice(["lps", "ras"], case_sensitive=False),
-    help="Frame of the files that say none.",
+    help="Axes of the files that say none.",
 )
 @click.option("--observed", multiple=True, metavar="WHERE", help="The side that a camera sees.")
 @click.option("--zone", "zones", multiple=True, metavar="NAME=WHERE", help="Where tools may touch (may be repeated).")
@@ -483,12 +483,12 @@ def build(
       halfspace:0,0,12mm:0,0,-1  a point, and the side that the normal points to
       seen-from:0,-400,100mm     what a camera at that place sees
 
-    A FILE in another unit or frame has it behind its name: veins.ply:mm, tumour.stl:cm:ras.
+    A FILE in another unit or on other axes has them behind its name: veins.ply:mm, tumour.stl:cm:ras.
     """  # noqa: D301  (click's mark for lines that are kept)
     from .chain import build_twin
 
     body = {
-        "source": _with_frame(_resolved(str(surface_or_mesh))),
+        "source": _with_axes(_resolved(str(surface_or_mesh))),
         "fixed": " + ".join(map(_resolved, given["fixed"])),
         "observed": " + ".join(map(_resolved, given["observed"])),
         "zones": _named("--zone", zones),
@@ -525,10 +525,10 @@ def _named(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:
     return named
 
 
-def _with_frame(source: str) -> str:
-    """The source with the frame that it states about itself, so that the configuration holds it."""
+def _with_axes(source: str) -> str:
+    """The source with the axes that it states about itself, so that the configuration holds it."""
     file = parse_file(source)
-    return str(file if file.frame else replace(file, frame=stated_frame(file.path)))
+    return str(file if file.axes else replace(file, axes=stated_axes(file.path)))
 
 
 def _resolved(where: str) -> str:

@@ -11,7 +11,7 @@ import tomlkit
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from softtwin.meshes.attachment import parse_file
-from softtwin.meshes.files import Frame
+from softtwin.meshes.files import Axes
 
 from .unknowns import WORDS as UNKNOWNS
 from .unknowns import Unknown
@@ -39,7 +39,7 @@ _WHERE = (
 
 
 class BodySection(_Section):
-    """Where the body comes from. A file with another unit or frame has it behind its name (veins.ply:mm:ras)."""
+    """Where the body comes from. A file with another unit or axes has them behind its name (veins.ply:mm:ras)."""
 
     source: str = Field(
         "liver-phantom",
@@ -48,7 +48,7 @@ class BodySection(_Section):
     unit: Literal["m", "cm", "mm"] = Field("m", description="unit of length in the files")
     frame: Literal["", "lps", "ras"] = Field(
         "",
-        description="frame of the files that say none, lps or ras; files in ras are turned, inside it is lps",
+        description="axes of the files that say none, lps or ras; files in ras are turned, inside it is lps",
     )
     cell_size: float = Field(0.0, ge=0.0, description="edge length of the tetrahedra in metres; 0: from nodes")
     nodes: Count = Field(2000, description="number of nodes wanted where a surface is made solid and cell_size is 0")
@@ -181,7 +181,12 @@ class TrainingSection(_Section):
     seconds: Positive = Field(
         120.0, description="wall time to train: ends with the step under way; reading the data not counted"
     )
-    epochs: int = Field(0, ge=0, description="passes over the samples instead, whatever time they take; 0: by seconds")
+    epochs: int = Field(
+        0,
+        ge=0,
+        description="passes over the samples (reduced network: and their symmetric images) instead, whatever time they "
+        "take; 0: by seconds",
+    )
     seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
     precision: Literal["single", "mixed"] = Field(
         "single", description="mixed: products in bfloat16, for large networks on a GPU"
@@ -336,13 +341,13 @@ class Config(_Section):
         return self
 
 
-def files_frame(section: BodySection) -> Frame | None:
-    """The frame of a body's source, and of all files and coordinates that say none; None where nobody says.
+def files_axes(section: BodySection) -> Axes | None:
+    """The axes of a body's source, and of all files and coordinates that say none; None where nobody says.
 
     Args:
         section: the configuration's [body].
     """
-    return parse_file(section.source).frame or section.frame or None
+    return parse_file(section.source).axes or section.frame or None
 
 
 def read_config(path: Path | str) -> tuple[Config, Path]:

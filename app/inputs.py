@@ -211,9 +211,9 @@ def _flat(prefix: str, entries: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def _content(value: Any, root: Path) -> Any:
     if isinstance(value, str) and value:
-        named = parse_file(value)  # its unit and frame may stand behind it, or words may stand there instead
+        named = parse_file(value)  # its unit and axes may stand behind it, or words may stand there instead
         if (root / named.path).is_file():
-            behind = "".join(f":{word}" for word in (named.unit, named.frame) if word)
+            behind = "".join(f":{word}" for word in (named.unit, named.axes) if word)
             return f"sha256:{_sha256(root / named.path)}{behind}"
     return [_content(item, root) for item in value] if isinstance(value, list | tuple) else value
 

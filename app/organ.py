@@ -26,19 +26,19 @@ from softtwin.meshes.embedding import embed
 from softtwin.meshes.files import (
     LARGEST,
     SMALLEST,
+    Axes,
     FileError,
-    Frame,
     Unit,
     read_cloud,
     read_mesh,
     read_surface,
-    stated_frame,
+    stated_axes,
 )
 from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam, liver_phantom, propeller
 from softtwin.meshes.solidify import solidify
 
-from .config import BodySection, ConfigError, files_frame
+from .config import BodySection, ConfigError, files_axes
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -63,17 +63,17 @@ class Organ:
 
 @dataclass(frozen=True)
 class _Reader:
-    """How the files of one body are read: where they lie, their unit and frame (None: nobody says the source's)."""
+    """How the files of one body are read: where they lie, their unit and axes (None: nobody says the source's)."""
 
     root: Path
     unit: Unit
-    frame: Frame | None
+    axes: Axes | None
 
-    def options(self, file: File) -> tuple[Path, Unit, Frame]:
-        """Path, unit and frame to read a file with; one that says no frame has that of the source."""
+    def options(self, file: File) -> tuple[Path, Unit, Axes]:
+        """Path, unit and axes to read a file with; one that says no axes has those of the source."""
         path = self.root / file.path
-        frame = file.frame or stated_frame(path) or self.frame
-        return path, file.unit or self.unit, frame if frame and self.frame else "lps"
+        axes = file.axes or stated_axes(path) or self.axes
+        return path, file.unit or self.unit, axes if axes and self.axes else "lps"
 
 
 def make_body(section: BodySection, root: Path) -> Body:
@@ -99,11 +99,11 @@ def make_organ(section: BodySection, root: Path) -> Organ:
         body = SHAPES[section.source](**_shape_options(section))
     else:
         source = parse_file(section.source)
-        _check_stated_frame(section, root)
-        reader = _Reader(root, section.unit, files_frame(section))
+        _check_stated_axes(section, root)
+        reader = _Reader(root, section.unit, files_axes(section))
         points, cells, notes = _solid(section, reader, source)
         body = Body(points, cells, {})
-        notes += [f"frame: {reader.frame.upper()}, inside LPS" if reader.frame else "frame: none said, nothing turned"]
+        notes += [f"axes: {reader.axes.upper()}, inside LPS" if reader.axes else "axes: none said, nothing turned"]
     for name, text in section.inner.items():
         surface = read_surface(*reader.options(parse_file(text)))
         notes += _outside(body, name, surface)
@@ -139,14 +139,14 @@ def _on_grid(body: Body, edge: float) -> tuple[Body, str]:
     return grid, f"grid: {len(grid.cells)} hexahedra of {1e3 * edge:g} mm, {share:.4f} of the volume"
 
 
-def _check_stated_frame(section: BodySection, root: Path) -> None:
-    """Refuse a source in RAS whose configuration does not say so: clouds would be read in another frame later.
+def _check_stated_axes(section: BodySection, root: Path) -> None:
+    """Refuse a source in RAS whose configuration does not say so: clouds would be read on other axes later.
 
     Raises:
         ConfigError: with what to write.
     """
     path = root / parse_file(section.source).path
-    if path.is_file() and stated_frame(path) == "ras" and files_frame(section) is None:
+    if path.is_file() and stated_axes(path) == "ras" and files_axes(section) is None:
         raise ConfigError(
             f"body.source: {path} states that it is in RAS, which the configuration must say for what comes later: "
             f'write source = "{section.source}:ras".'
@@ -164,7 +164,7 @@ def _checked_regions(section: BodySection, root: Path) -> dict[str, tuple[Region
     texts = {"fixed": section.fixed, "observed": section.observed}
     texts |= {f"zones.{name}": text for name, text in section.zones.items()}
     regions = {name: parse_regions(text, section.unit) if text else () for name, text in texts.items()}
-    if files_frame(section) == "ras":
+    if files_axes(section) == "ras":
         regions = {name: tuple(map(turned, group)) for name, group in regions.items()}
     structures = (*section.inner, *_OWN_STRUCTURES.get(section.source, ()))
     for region in (region for group in regions.values() for region in group):
@@ -215,7 +215,7 @@ def _outside(body: Body, name: str, surface: Surface) -> list[str]:
     if share > _MOSTLY:
         raise BodyError(
             f"body.inner.{name}: expected a surface inside the organ, got {100 * share:.0f} % of its vertices outside, "
-            f"up to {1e3 * outside.max():.1f} mm; has its file another unit (FILE:mm) or frame (FILE:ras)?"
+            f"up to {1e3 * outside.max():.1f} mm; has its file another unit (FILE:mm) or other axes (FILE:ras)?"
         )
     if share > 0:
         return [
@@ -264,7 +264,7 @@ def _nodes_of_file(body: Body, name: str, file: File, near: float, reader: _Read
     if len(nodes) == 0:
         raise BodyError(
             f"{name}: no boundary node lies within {1e3 * near:.1f} mm of the points in {path} "
-            f"(the nearest is {1e3 * distances.min():.1f} mm away). Same unit and frame? Else "
+            f"(the nearest is {1e3 * distances.min():.1f} mm away). Same unit and axes? Else "
             f"{'raise --fixed-distance' if name == 'body.fixed' else 'give points nearer to the surface'}."
         )
     return nodes
@@ -324,6 +324,6 @@ def _triangles_of_file(body: Body, file: File, reader: _Reader) -> Ints:
     if not (distances <= near).any():
         raise ConfigError(
             f"body.observed: no boundary triangle lies within {1e3 * near:.1f} mm of {path} "
-            f"(the nearest is {1e3 * distances.min():.1f} mm away). Same unit and frame?"
+            f"(the nearest is {1e3 * distances.min():.1f} mm away). Same unit and axes?"
         )
     return body.boundary[distances <= near]

@@ -136,7 +136,7 @@ def read_truth(path: Path, frames: int, body: Body, coordinates: Coordinates) ->
     if away > _FAR_OFF * body.size:
         raise ConfigError(
             f"--truth: expected positions in metres in which the fixed nodes are where the body has them, got them "
-            f"{away:.3g} m away on average in {path}; are these displacements, or in another unit or frame?"
+            f"{away:.3g} m away on average in {path}; are these displacements, or in another unit or on other axes?"
         )
     return turned
 

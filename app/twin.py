@@ -46,7 +46,7 @@ from softtwin.registration.rigid import align
 from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Judgement, Verdict
 
-from .config import Config, ConfigError, RegistrationSection, files_frame, parse_config
+from .config import Config, ConfigError, RegistrationSection, files_axes, parse_config
 from .inputs import check_material, load_plan
 from .unknowns import Scenario, UnknownError
 from .workspace import open_workspace
@@ -549,7 +549,7 @@ def with_options(config: Config, options: dict[str, Any]) -> Config:
 
 def coordinates_of(config: Config) -> Coordinates:
     """Unit and axes of the files that a body was made from."""
-    return Coordinates(config.body.unit, files_frame(config.body) or "lps")
+    return Coordinates(config.body.unit, files_axes(config.body) or "lps")
 
 
 @dataclass(frozen=True, eq=False)

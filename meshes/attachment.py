@@ -8,7 +8,7 @@ are in a unit that the caller names, the place's unit stands behind its last num
     box:0,0,0:40,30,20mm            two opposite corners
     halfspace:0,0,12mm:0,0,-1       the side of the plane through the point to which the normal points
     seen-from:0,-400,100mm          what a camera at the place sees
-    veins.ply, veins.ply:mm:ras     near the points of a file, with its unit and frame where it has others
+    veins.ply, veins.ply:mm:ras     near the points of a file, with its unit and axes where it has others
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from .body import Body, Floats, Ints
 from .closest import distances
 from .clouds import triangles_seen_from
-from .files import FRAMES, UNITS, Frame, Unit, in_metres
+from .files import AXES, UNITS, Axes, Unit, in_metres
 from .metrics import edge_lengths
 
 Vector = tuple[float, float, float]
@@ -88,15 +88,15 @@ class File:
     Args:
         path: the file.
         unit: its unit of length; None for the unit of the body's files.
-        frame: its frame; None for what the file says itself, else the frame of the body's files.
+        axes: its axes; None for what the file says itself, else those of the body's files.
     """
 
     path: Path
     unit: Unit | None = None
-    frame: Frame | None = None
+    axes: Axes | None = None
 
     def __str__(self) -> str:
-        return ":".join(map(str, filter(None, (self.path, self.unit, self.frame))))
+        return ":".join(map(str, filter(None, (self.path, self.unit, self.axes))))
 
 
 Shape = Near | Ball | Box | HalfSpace | SeenFrom
@@ -156,27 +156,27 @@ def _turned(vector: Vector) -> Vector:
 
 
 def parse_file(text: str) -> File:
-    """The file that a text names: a path, with `:mm`, `:lps` or both behind it where its unit or frame differ.
+    """The file that a text names: a path, with `:mm`, `:lps` or both behind it where its unit or axes differ.
 
     Args:
         text: the description.
 
     Raises:
-        RegionError: a unit or frame is given twice, or there is no path.
+        RegionError: unit or axes are given twice, or there is no path.
     """
-    path, unit, frame = text, None, None
+    path, unit, axes = text, None, None
     while not Path(path).exists() and ":" in path:
         rest, _, last = path.rpartition(":")
         if last in UNITS and unit is None:
             path, unit = rest, last
-        elif last.lower() in FRAMES and frame is None:
-            path, frame = rest, last.lower()
+        elif last.lower() in AXES and axes is None:
+            path, axes = rest, last.lower()
         else:
             break
     if not path:
         raise RegionError(f"{text!r}: expected a file, with :m, :cm, :mm, :lps or :ras behind it where it has another "
-                          "unit or frame.")  # fmt: skip
-    return File(Path(path), unit, frame)  # type: ignore[arg-type]
+                          "unit or axes.")  # fmt: skip
+    return File(Path(path), unit, axes)  # type: ignore[arg-type]
 
 
 def boundary_nodes(region: Shape, body: Body) -> Ints:
@@ -244,7 +244,7 @@ def _checked(region: Near | Ball | Box | HalfSpace, body: Body, points: Floats, 
     if not (depths >= 0).any():
         raise RegionError(
             f"{_plain(region)}: holds no {what} of the body's boundary; the nearest is {-1e3 * depths.max():.1f} mm "
-            "away from it. Same unit and frame? Else make it larger."
+            "away from it. Same unit and axes? Else make it larger."
         )
     return depths >= 0
 

@@ -19,7 +19,7 @@ from vtkmodules.vtkIOPLY import vtkPLYWriter
 from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
 from .body import Floats, Ints, Surface
-from .files import FileError, Frame, Unit
+from .files import Axes, FileError, Unit
 
 SURFACE_FORMATS = ("stl", "ply", "vtp")
 PER_METRE: Mapping[str, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
@@ -36,7 +36,7 @@ class Coordinates:
     """
 
     unit: Unit = "m"
-    axes: Frame = "lps"
+    axes: Axes = "lps"
 
     def __post_init__(self) -> None:
         if self.unit not in PER_METRE or self.axes not in _TURN:

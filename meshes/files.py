@@ -29,9 +29,9 @@ from .elements import KINDS
 from .ply import read_ply, read_ply_normals
 
 Unit = Literal["m", "cm", "mm"]
-Frame = Literal["lps", "ras"]
+Axes = Literal["lps", "ras"]
 UNITS: tuple[str, ...] = get_args(Unit)
-FRAMES: tuple[str, ...] = get_args(Frame)
+AXES: tuple[str, ...] = get_args(Axes)
 
 _log = logging.getLogger(__name__)
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -93,8 +93,8 @@ def in_metres(lengths: ArrayLike, unit: Unit) -> Floats:
     return np.asarray(lengths, dtype=np.float64) / round(1 / _METRES[unit])
 
 
-def stated_frame(path: str | Path) -> Frame | None:
-    """The frame that a file states about itself, as 3D Slicer writes it (`SPACE=RAS` in its comment); None for none.
+def stated_axes(path: str | Path) -> Axes | None:
+    """The axes that a file states about itself, as 3D Slicer writes it (`SPACE=RAS` in its comment); None for none.
 
     Args:
         path: any file.
@@ -106,7 +106,7 @@ def stated_frame(path: str | Path) -> Frame | None:
     return found.group(1).decode().lower() if found else None  # type: ignore[return-value]
 
 
-def read_mesh(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Surface | tuple[Floats, Ints]:
+def read_mesh(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Surface | tuple[Floats, Ints]:
     """What a mesh file holds: points and cells where it has tetrahedra or hexahedra, else a surface.
 
     Args:
@@ -123,7 +123,7 @@ def read_mesh(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Surfac
     return _surface(Path(path), mesh, unit, axes)
 
 
-def read_surface(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Surface:
+def read_surface(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Surface:
     """The triangles of a file as a surface in metres; quadrilaterals are split, vertices at one place merged.
 
     Args:
@@ -137,7 +137,7 @@ def read_surface(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> Sur
     return _surface(Path(path), _read(path), unit, axes)
 
 
-def read_volume(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> tuple[Floats, Ints]:
+def read_volume(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> tuple[Floats, Ints]:
     """Points (n, 3) in metres and cells (m, 4) or (m, 8) of a volume mesh, the file's node numbers kept.
 
     Args:
@@ -151,7 +151,7 @@ def read_volume(path: str | Path, unit: Unit = "m", axes: Frame = "lps") -> tupl
     return _volume(Path(path), _read(path), unit, axes)
 
 
-def read_cloud(path: str | Path, unit: Unit = "m", axes: Frame = "lps", normals: bool = False) -> Floats:
+def read_cloud(path: str | Path, unit: Unit = "m", axes: Axes = "lps", normals: bool = False) -> Floats:
     """The points of a file, (p, 3), metres; with the normals measured there (p, 6).
 
     Args:
@@ -543,7 +543,7 @@ def _is_numeric(line: str) -> bool:
         return False
 
 
-def _surface(path: Path, mesh: _Mesh, unit: Unit, axes: Frame) -> Surface:
+def _surface(path: Path, mesh: _Mesh, unit: Unit, axes: Axes) -> Surface:
     triangles = mesh.triangles
     if len(triangles) == 0:
         raise FileError(f"{path}: expected a surface of triangles, got {mesh.content}.")
@@ -557,7 +557,7 @@ def _surface(path: Path, mesh: _Mesh, unit: Unit, axes: Frame) -> Surface:
     return Surface(points, numbers.reshape(-1, 3).astype(np.int64))
 
 
-def _volume(path: Path, mesh: _Mesh, unit: Unit, axes: Frame) -> tuple[Floats, Ints]:
+def _volume(path: Path, mesh: _Mesh, unit: Unit, axes: Axes) -> tuple[Floats, Ints]:
     kinds = [kind for kind in ("tetra", "hexahedron") if kind in mesh.cells]
     if not kinds:
         advice = "; a surface must be made solid first (softtwin build does it)" if len(mesh.triangles) else ""
@@ -575,7 +575,7 @@ def _turned(path: Path, points: Floats, cells: Ints) -> Ints:
     return cells[:, [0, 2, 1, 3]] if cells.shape[1] == 4 else cells[:, [4, 5, 6, 7, 0, 1, 2, 3]]
 
 
-def _placed(path: Path, points: Floats, unit: Unit, axes: Frame, smallest: float) -> Floats:
+def _placed(path: Path, points: Floats, unit: Unit, axes: Axes, smallest: float) -> Floats:
     if unit not in _METRES:
         raise ValueError(f"unit: expected 'm', 'cm' or 'mm', got {unit!r}.")
     if axes not in ("lps", "ras"):

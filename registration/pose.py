@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from softtwin.meshes.export import PER_METRE
-from softtwin.meshes.files import FileError, Frame, Unit
+from softtwin.meshes.files import Axes, FileError, Unit
 
 Floats = NDArray[np.float64]
 
@@ -247,13 +247,13 @@ def _itk_matrix(path: Path) -> Any:
     return matrix
 
 
-def read_landmarks(path: str | Path, unit: Unit = "m", frame: Frame | None = None) -> dict[str, Floats]:
+def read_landmarks(path: str | Path, unit: Unit = "m", axes: Axes | None = None) -> dict[str, Floats]:
     """Named points of a file, each (3,), metres.
 
     Args:
         path: TXT or CSV with lines `name,x,y,z`, or points that 3D Slicer marked (`.fcsv`, `.mrk.json`).
         unit: unit of TXT and CSV, and of Slicer's files where they say none other than their millimetres.
-        frame: `lps` or `ras` turns the points of a file that says its axes to these; otherwise they stay as they are.
+        axes: `lps` or `ras` turns the points of a file that says its axes to these; otherwise they stay as they are.
 
     Raises:
         FileError: missing or damaged file, another suffix, no points, or a name twice; the message names it.
@@ -261,11 +261,11 @@ def read_landmarks(path: str | Path, unit: Unit = "m", frame: Frame | None = Non
     path = _existing(path)
     try:
         if path.name.lower().endswith(".json"):
-            named, axes, unit = _markup_points(path)
+            named, own, unit = _markup_points(path)
         elif path.suffix.lower() == ".fcsv":
-            named, axes, unit = *_fiducials(path), "mm"
+            named, own, unit = *_fiducials(path), "mm"
         elif path.suffix.lower() in (".csv", ".txt"):
-            named, axes = _named_rows(path), None
+            named, own = _named_rows(path), None
         else:
             raise FileError(f"{path}: expected landmarks as .csv, .txt, .fcsv or .mrk.json, got {path.suffix!r}.")
         points = [(name, np.array(place, dtype=np.float64) / _per_metre(unit)) for name, place in named]
@@ -273,7 +273,7 @@ def read_landmarks(path: str | Path, unit: Unit = "m", frame: Frame | None = Non
         raise
     except (ValueError, TypeError, KeyError, IndexError, OSError) as error:
         raise FileError(f"{path}: expected points, each a name with x, y and z ({error}).") from error
-    turn = _TURN if frame is not None and axes not in (None, frame) else np.ones(3)
+    turn = _TURN if axes is not None and own not in (None, axes) else np.ones(3)
     return {name: turn * place for name, place in _checked_points(path, points)}
 
 
@@ -291,7 +291,7 @@ def _named_rows(path: Path) -> _Named:
     return [(row[0], row[1:]) for row in rows]
 
 
-def _fiducials(path: Path) -> tuple[_Named, Frame]:
+def _fiducials(path: Path) -> tuple[_Named, Axes]:
     said = "0"
     columns = ["id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label"]
     rows = []
@@ -306,7 +306,7 @@ def _fiducials(path: Path) -> tuple[_Named, Frame]:
     return named, _axes(path, {"0": "RAS", "1": "LPS"}.get(said, said))
 
 
-def _markup_points(path: Path) -> tuple[_Named, Frame, Unit]:
+def _markup_points(path: Path) -> tuple[_Named, Axes, Unit]:
     markup = json.loads(path.read_text())["markups"][0]
     points = [point for point in markup["controlPoints"] if point.get("positionStatus", "defined") == "defined"]
     units = markup.get("coordinateUnits", "mm")
@@ -320,7 +320,7 @@ def _unit(path: Path, said: str) -> Unit:
     raise FileError(f"{path}: expected points in m, cm or mm, got {said!r}.")
 
 
-def _axes(path: Path, said: str) -> Frame:
+def _axes(path: Path, said: str) -> Axes:
     if said.upper() == "LPS":
         return "lps"
     if said.upper() == "RAS":

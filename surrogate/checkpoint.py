@@ -60,8 +60,9 @@ def read_checkpoint(path: Path, plan: TrainingPlan, mark: str) -> dict[str, Any]
             f"train.folder: {path} is of another version of this program, which trains in another way; choose another "
             "folder, or train from the start (`softtwin train --fresh`)."
         )
-    wanted = plan.entries()
-    differing = [name for name in wanted if course["plan"].get(name) != wanted[name]]
+    wanted, usual = plan.entries(), TrainingPlan(type(plan.architecture)()).entries()
+    stored = {**usual, **course["plan"]}  # a setting that is newer than the checkpoint was as usual
+    differing = [name for name in wanted if stored[name] != wanted[name]]
     if differing:
         raise CheckpointError(
             f"train.folder: {path} belongs to another plan (differs in {', '.join(differing)}); choose another folder, "

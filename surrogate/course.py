@@ -60,7 +60,12 @@ def chosen_device(plan: TrainingPlan) -> str:
 
 
 def _count_steps(plan: TrainingPlan, sample_count: int) -> int | None:
-    """Steps of a training by epochs, a multiple of the steps of a round; None where the clock ends it."""
+    """Steps of a training by epochs, a multiple of the steps of a round; None where the clock ends it.
+
+    Args:
+        plan: how to train.
+        sample_count: of the lesson, symmetric images counted.
+    """
     if plan.epochs is None:
         return None
     wanted = math.ceil(plan.epochs * sample_count / plan.batch_size(sample_count))
@@ -84,7 +89,7 @@ class Batches:
     """Sample numbers of each step of a round, shuffled passes one after the other: a loader without workers.
 
     Args:
-        count: number of samples.
+        count: number of samples, symmetric images counted.
         batch: samples a step.
         steps: steps of the round.
         seed: seed of the training.

@@ -35,6 +35,7 @@ class Value(nn.Module):
     Args:
         surrogate: what predicts.
         basis: forces at the loaded nodes for unit coefficients, (3l, k), newtons.
+        kind: precision of all, that of what is exported if not said.
     """
 
     offset: Tensor
@@ -42,18 +43,17 @@ class Value(nn.Module):
     encode: Tensor
     decode: Tensor | None
 
-    def __init__(self, surrogate: Surrogate, basis: Floats) -> None:
+    def __init__(self, surrogate: Surrogate, basis: Floats, kind: torch.dtype = torch.float32) -> None:
         super().__init__()
         maps = surrogate.maps
-        self.network = copy.deepcopy(surrogate.network).float().requires_grad_(False)
+        self.network = copy.deepcopy(surrogate.network).to(kind).requires_grad_(False)
         for name, values in (
             ("offset", maps.offset),
             ("linear", maps.linear(basis)),
             ("encode", maps.encoded(basis)),
             ("decode", maps.decode),
         ):
-            tensor = None if values is None else torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
-            self.register_buffer(name, tensor)
+            self.register_buffer(name, None if values is None else torch.tensor(values, dtype=kind))
 
     def forward(self, coefficients: Tensor) -> Tensor:
         """Displacements for coefficients."""

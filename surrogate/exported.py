@@ -61,15 +61,14 @@ class ExportedTwin:
         """Displacements, (n, 3) or (s, n, 3), metres, under nodal forces of the same shape, newtons.
 
         Raises:
-            ValueError: another shape, numbers that are not finite, or forces at nodes that never carry load.
+            ValueError: no real numbers, another shape, numbers that are not finite, or forces at nodes that never carry
+                load.
         """
-        given = np.asarray(forces, dtype=np.float64)
+        given = _numbers("forces", forces)
         if given.ndim not in (2, 3) or given.shape[-2:] != (self.nodes, 3):
             raise ValueError(
                 f"ExportedTwin.forces: expected shape ({self.nodes}, 3) or (s, {self.nodes}, 3), got {given.shape}."
             )
-        if not np.isfinite(given).all():
-            raise ValueError("ExportedTwin.forces: expected finite numbers, got NaN or infinity.")
         batch = given.reshape(-1, self.nodes, 3)
         idle = np.abs(np.delete(batch, self.loaded, axis=1)).max(initial=0.0)
         if idle > 0.0:
@@ -85,15 +84,27 @@ class ExportedTwin:
         """Displacement, (n, 3), metres, and its derivative, (3n, k), for coefficients of the directions, (k,), newtons.
 
         Raises:
-            ValueError: another shape, or numbers that are not finite.
+            ValueError: no real numbers, another shape, or numbers that are not finite.
         """
-        given = np.asarray(coefficients, dtype=np.float64)
-        count = self.directions.shape[1]
-        if given.shape != (count,) or not np.isfinite(given).all():
-            raise ValueError(f"ExportedTwin.coefficients: expected {count} finite numbers, got shape {given.shape}.")
+        given, expected = _numbers("coefficients", coefficients), self.directions.shape[1:]
+        if given.shape != expected:
+            raise ValueError(f"ExportedTwin.coefficients: expected shape {expected}, got {given.shape}.")
         displacement, jacobian = self._linearised.run(None, {"coefficients": given.astype(np.float32)})
         moved = np.asarray(displacement, dtype=np.float64).reshape(-1, 3)
         return moved, np.asarray(jacobian, dtype=np.float64)
+
+
+def _numbers(name: str, values: ArrayLike) -> Floats:
+    """Finite numbers of any shape; here, since `checked_array` would load more than NumPy."""
+    try:
+        given = np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"ExportedTwin.{name}: expected an array, got rows of different lengths.") from error
+    if given.dtype.kind not in "biuf":
+        raise ValueError(f"ExportedTwin.{name}: expected real numbers, got {given.dtype}.")
+    if not np.isfinite(given).all():
+        raise ValueError(f"ExportedTwin.{name}: expected finite numbers, got NaN or infinity.")
+    return given.astype(np.float64, copy=False)
 
 
 def _checked(folder: Path) -> dict[str, Any]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal, cast, get_args
 
 import numpy as np
 import torch
@@ -20,6 +20,15 @@ from .maps import LinearMaps, no_response
 from .scaled import ScaledLesson
 
 Floats = NDArray[np.float64]
+Activation = Literal["relu", "tanh", "gelu", "silu"]
+
+_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "relu": torch.relu,
+    "tanh": torch.tanh,
+    "gelu": nn.functional.gelu,
+    "silu": nn.functional.silu,
+}
+_LETTERS = "activation_letters"  # name of a tensor
 
 
 @dataclass(frozen=True)
@@ -28,12 +37,14 @@ class Perceptron:
 
     Args:
         width: width of the first and of the two hidden layers; None for that of the displacement, 3n.
+        activation: after each of these layers; ReLU unless said, since the thesis recommends it (section 3.2).
 
     Raises:
         ValueError: an argument out of its range.
     """
 
     width: int | None = None
+    activation: Activation = "relu"
 
     name: ClassVar[str] = "mlp"
     rate: ClassVar[float] = 1e-3
@@ -42,6 +53,9 @@ class Perceptron:
     def __post_init__(self) -> None:
         if self.width is not None and self.width < 1:
             raise ValueError(f"Perceptron.width: expected at least 1, got {self.width}.")
+        if self.activation not in get_args(Activation):
+            known = ", ".join(get_args(Activation))
+            raise ValueError(f"Perceptron.activation: expected one of {known}, got {self.activation!r}.")
 
     def check(self, body: Body) -> None:
         """Any body will do."""
@@ -56,9 +70,15 @@ class Perceptron:
 
     @staticmethod
     def revived(tensors: Mapping[str, Tensor]) -> HiddenLayers:
-        """The predicting network from what its `state_dict` was."""
+        """The predicting network from what its `state_dict` was.
+
+        Raises:
+            ValueError: an activation that this version does not know.
+        """
         bias = tensors["first.bias"]
-        network = HiddenLayers(len(bias), (len(tensors) - 1) // 2).to(bias)
+        depth = sum(name.startswith("hidden") and name.endswith("bias") for name in tensors)
+        settings = Perceptron(len(bias), _activation_in(tensors))
+        network = HiddenLayers(len(bias), depth, activation=settings.activation).to(bias)
         network.load_state_dict(dict(tensors))
         return network.requires_grad_(False)
 
@@ -81,27 +101,37 @@ class Bias(nn.Module):
 
 
 class HiddenLayers(Network):
-    """What lies between the first and the last matrix of the perceptron, ReLU after each layer.
-
-    ReLU since the thesis, which does not name the activation of its perceptron, recommends it (section 3.2).
+    """What lies between the first and the last matrix of the perceptron, an activation after each layer.
 
     Args:
         width: width of all layers.
         depth: number of hidden layers.
         inputs: of the first layer.
+        activation: its name.
     """
 
-    def __init__(self, width: int, depth: int = 2, inputs: int = 1) -> None:
+    def __init__(self, width: int, depth: int = 2, inputs: int = 1, activation: Activation = "relu") -> None:
         super().__init__()
+        self.activation = activation
         self.first = Bias(inputs, width)
         self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(depth))
+        if activation != "relu":  # of twins and checkpoints that say none
+            self.register_buffer(_LETTERS, torch.tensor(list(activation.encode()), dtype=torch.uint8))
 
     def forward(self, coordinates: Tensor) -> Tensor:
         """Last hidden values, (s, w), for first ones before their bias, (s, w)."""
-        values = torch.relu(self.first(coordinates))
+        active = _ACTIVATIONS[self.activation]
+        values = active(self.first(coordinates))
         for layer in self.hidden:
-            values = torch.relu(layer(values))
+            values = active(layer(values))
         return values
+
+
+def _activation_in(tensors: Mapping[str, Tensor]) -> Activation:
+    """The name that a network keeps among its weights, which say all that a twin needs."""
+    letters = tensors.get(_LETTERS)
+    name = "relu" if letters is None else bytes(letters.tolist()).decode(errors="replace")
+    return cast("Activation", name)
 
 
 class PerceptronNetwork(nn.Module):
@@ -111,12 +141,13 @@ class PerceptronNetwork(nn.Module):
         inputs: components of the forces, 3l.
         width: width of the first and of the hidden layers.
         outputs: components of the displacement, 3n.
+        activation: its name.
     """
 
-    def __init__(self, inputs: int, width: int, outputs: int) -> None:
+    def __init__(self, inputs: int, width: int, outputs: int, activation: Activation = "relu") -> None:
         super().__init__()
         self.enter = nn.Linear(inputs, width, bias=False)
-        self.inner = HiddenLayers(width, inputs=inputs)
+        self.inner = HiddenLayers(width, inputs=inputs, activation=activation)
         self.leave = nn.Linear(width, outputs)
 
     def forward(self, forces: Tensor) -> Tensor:
@@ -140,7 +171,7 @@ class PerceptronLesson(ScaledLesson):
     def __init__(self, data: DataSet, train: Samples, validation: Samples, settings: Perceptron) -> None:
         super().__init__(data, train, validation)
         inputs, outputs = self.forces.shape[1], train.displacements[0].size
-        self.network = PerceptronNetwork(inputs, settings.width or outputs, outputs)
+        self.network = PerceptronNetwork(inputs, settings.width or outputs, outputs, settings.activation)
 
     def maps(self) -> LinearMaps:
         """First matrix, last matrix and last bias, with the scale factors in them."""

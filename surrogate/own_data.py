@@ -48,8 +48,8 @@ def data_set_from_arrays(
     forces: ArrayLike,
     displacements: ArrayLike,
     *,
-    length_unit: LengthUnit,
-    force_unit: ForceUnit,
+    length_unit: LengthUnit | None = None,
+    force_unit: ForceUnit | None = None,
     material: Material | None = None,
     splits: Mapping[str, ArrayLike] | None = None,
     seed: int = 0,
@@ -66,8 +66,8 @@ def data_set_from_arrays(
         body: what was simulated; its node order is that of the arrays.
         forces: nodal forces of each sample, (s, n, 3).
         displacements: equilibria, (s, n, 3).
-        length_unit: of the displacements; the body is in metres in any case.
-        force_unit: of the forces.
+        length_unit: of the displacements; the body is in metres in any case. It must be said, since no array shows it.
+        force_unit: of the forces; likewise.
         material: strain energy, if it is one of this package with constant parameters; losses that know physics
             need it.
         splits: numbers of the samples of `train`, `validation` and `test`: samples of one motion belong into one of
@@ -122,7 +122,11 @@ def _fields(name: str, values: ArrayLike, body: Body) -> Floats:
     return array
 
 
-def _scale(name: str, known: Mapping[str, float], unit: str) -> float:
+def _scale(name: str, known: Mapping[str, float], unit: str | None) -> float:
+    if unit is None:
+        raise ValueError(
+            f"data_set_from_arrays.{name}: expected one of {', '.join(known)}, got none; arrays show none."
+        )
     if unit not in known:
         raise ValueError(f"data_set_from_arrays.{name}: expected one of {', '.join(known)}, got {unit!r}.")
     return known[unit]

@@ -23,7 +23,9 @@ class TrainingPlan:
         seconds: wall time of the steps, the looks at the validation split and the checkpoints together. The clock is
             looked at before every step, so that training ends with the step that is under way when the time is over,
             on a busy machine too (with fewer steps then). Reading the data and finding the modes come before it.
-        epochs: passes over the training samples; given, it replaces `seconds`.
+        epochs: passes over all that a network learns from: the training samples and, of a reduced network, their
+            symmetric images, of which one pass is as many over the samples as the body has symmetries. Given, it
+            replaces `seconds`.
         batch: samples a step; None for the architecture's own.
         learning_rate: highest of the cosine; None for the architecture's own.
         samples: draws of the training split to use; None for all.
@@ -33,7 +35,8 @@ class TrainingPlan:
         precision: `single`, or `mixed`: products of matrices in bfloat16, which has three digits; it suits large
             networks on a GPU, and not one that is to be right to a thousandth.
         device: where to train; `auto` takes a GPU where torch sees one.
-        processes: that share each batch, on a GPU each, or on the cores of one machine.
+        processes: that share each batch, on a GPU each, or on the cores of one machine. They learn what one would, from
+            whole Jacobians in the mean: each process draws directions of its own.
 
     Raises:
         ValueError: an argument out of its range.

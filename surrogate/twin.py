@@ -17,6 +17,7 @@ from safetensors.numpy import save as save_tensors
 
 from softtwin.meshes.body import Body
 
+from .architecture import Network
 from .maps import LinearMaps
 from .model import Surrogate
 from .registry import ARCHITECTURES
@@ -91,8 +92,17 @@ def load(folder: Path | str, body: Body) -> Surrogate:
         name.removeprefix(_NETWORK): torch.tensor(array) for name, array in tensors.items() if name.startswith(_NETWORK)
     }
     with torch.random.fork_rng(devices=[]):  # the weights are given: the caller's chance is left alone
-        network = ARCHITECTURES[card["architecture"]].revived(weights)
+        network = _revived(folder, card["architecture"], weights)
     return Surrogate(body, LinearMaps(**maps), network, card)
+
+
+def _revived(folder: Path, architecture: str, weights: dict[str, torch.Tensor]) -> Network:
+    try:
+        return ARCHITECTURES[architecture].revived(weights)
+    except ValueError as error:
+        raise TwinError(
+            f"load.folder: the network in {folder} is of a newer version of this program: {error}"
+        ) from error
 
 
 def _read_card(path: Path) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def read_jacobians(data: DataSet, draws: Ints) -> Jacobians | None:
         draws: numbers of the samples' draws, (s,).
 
     Raises:
-        DataSetError: some of them were never finished, or are damaged.
+        DataSetError: some of them were never finished, are damaged, or hold numbers that are not finite.
     """
     modes, group = stored_modes(data), _group(data.path)
     if modes is None or group is None:
@@ -73,6 +73,12 @@ def read_jacobians(data: DataSet, draws: Ints) -> Jacobians | None:
             raise DataSetError(f"Jacobians: block {block} in {data.path} {state}; {_AGAIN}")
     part = slice(0, int(np.max(draws)) + 1)
     values, squares = (_read(data.path, group, name, part)[draws] for name in ("values", "squares"))
+    wrong = int((~(np.isfinite(values).all(axis=(1, 2)) & np.isfinite(squares))).sum())
+    if wrong or not np.isfinite(modes).all():
+        raise DataSetError(
+            f"Jacobians: expected finite numbers in {data.path}, got {wrong} of {len(values)} samples with others, or "
+            "such modes; solve the data set again (`softtwin generate --again`), or learn without them (sobolev = 0)."
+        )
     return Jacobians(modes, values, squares)
 
 

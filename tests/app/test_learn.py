@@ -35,6 +35,8 @@ def test_settings_and_physics_reach_the_plan() -> None:
         32, 128, 2, symmetries=False
     )
     assert plan(architecture="mlp", settings={"width": 1500}).architecture == Perceptron(1500)
+    smooth = plan(architecture="mlp", settings={"width": 20, "activation": "silu"})
+    assert smooth.architecture == Perceptron(20, "silu")
     grid = plan(architecture="umesh", settings={"channels": 16, "numbering": "long"}, physics={"energy": 0.5})
     assert grid.architecture == UMesh(16, numbering="long") and grid.physics == Physics(energy=0.5)
 
@@ -66,6 +68,10 @@ def test_they_survive_the_configuration_file(tmp_path: Path) -> None:
         ),
         ({"settings": {"depth": 0}}, r"training\.settings: Reduced\.depth: expected at least 1, got 0"),
         ({"settings": {"depth": "two"}}, r"training\.settings: "),
+        (
+            {"architecture": "mlp", "settings": {"activation": "swish"}},
+            r"training\.settings: Perceptron\.activation: expected one of relu, tanh, gelu, silu, got 'swish'",
+        ),
         ({"physics": {"work": 1.0}}, r"training\.physics: expected names among energy, residual, data, got work"),
         ({"physics": {"data": 0.0}}, r"training\.physics: Physics: expected a positive weight"),
     ],

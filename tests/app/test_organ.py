@@ -1,4 +1,4 @@
-"""The organ that a configuration describes: surfaces as they come, attachment in words, units, frames, what is said."""
+"""The organ that a configuration describes: surfaces as they come, attachment in words, units, axes, what is said."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("pytetwild", reason="the extra mesh is absent")
 
 from softtwin.app import organ as module
-from softtwin.app.cli import _with_frame, main
-from softtwin.app.config import BodySection, ConfigError, files_frame, parse_config
+from softtwin.app.cli import _with_axes, main
+from softtwin.app.config import BodySection, ConfigError, files_axes, parse_config
 from softtwin.app.organ import make_organ
 from softtwin.meshes.attachment import RegionError
 from softtwin.meshes.body import Body, BodyError
@@ -133,19 +133,19 @@ def _veins(files: Path, folder: Path, scale: float, turn: bool = False) -> Path:
     ],
 )
 def test_inside_all_is_lps(files: Path, tmp_path: Path, source: str, frame: str, veins: str, turn: bool) -> None:
-    """A file in the other frame than the source fits it once both are LPS; where the source says none nothing turns."""
+    """A file on other axes than the source fits it once both are LPS; where the source says none nothing turns."""
     path = _veins(files, tmp_path, 1e3, turn=turn)
     made = section(files, source=source, frame=frame, fixed=f"{path}{veins}", fixed_distance=1e-4)
     body, plain = make_organ(made, files).body, make(files)
     assert np.array_equal(body.fixed, plain.fixed)
-    sign = [-1, -1, 1] if files_frame(made) == "ras" else [1, 1, 1]
+    sign = [-1, -1, 1] if files_axes(made) == "ras" else [1, 1, 1]
     assert np.array_equal(body.points, plain.points * sign)
 
 
 @pytest.mark.parametrize(
     "where", ["ball:8,18,-20:24", "box:-200,-200,-200:200,10,-35", "halfspace:60,0,0:1,0.2,0", "seen-from:500,90,0"]
 )
-def test_coordinates_in_words_are_in_the_frame_of_the_source(files: Path, where: str) -> None:
+def test_coordinates_in_words_are_on_the_axes_of_the_source(files: Path, where: str) -> None:
     assert np.array_equal(make(files, fixed=where, source="organ.vtu:ras").fixed, make(files, fixed=where).fixed)
 
 
@@ -168,7 +168,7 @@ def test_a_source_that_states_ras_must_be_recorded(files: Path, tmp_path: Path, 
     path.write_text(path.read_text().replace("element", "comment SPACE=RAS\nelement", 1))
     with pytest.raises(ConfigError, match=r"states that it is in RAS, .* write source = \".*organ\.ply:ras\""):
         make(files, source=str(path))
-    assert _with_frame(str(path)) == f"{path}:ras"  # what `softtwin build` writes
+    assert _with_axes(str(path)) == f"{path}:ras"  # what `softtwin build` writes
 
 
 def test_an_inner_surface_outside_the_organ_is_refused_and_a_part_outside_is_said(files: Path, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from softtwin.meshes.files import (
     read_mesh,
     read_surface,
     read_volume,
-    stated_frame,
+    stated_axes,
     write_body,
     write_deformed,
 )
@@ -393,12 +393,12 @@ def test_a_text_cloud_cut_in_the_middle_of_a_number_is_refused(tmp_path: Path, b
     assert len(read_cloud(tmp_path / "free.txt")) == 4
 
 
-def test_a_frame_is_found_where_the_file_states_it(tmp_path: Path, ball: Surface) -> None:
+def test_axes_are_found_where_the_file_states_it(tmp_path: Path, ball: Surface) -> None:
     path = _save(tmp_path / "ball.stl", ball, binary=True)
-    assert stated_frame(path) is None
+    assert stated_axes(path) is None
     content = path.read_bytes()
     path.write_bytes(b"3D Slicer output. SPACE=RAS".ljust(80) + content[80:])
-    assert stated_frame(path) == "ras" and len(read_surface(path).points) == len(ball.points)
+    assert stated_axes(path) == "ras" and len(read_surface(path).points) == len(ball.points)
 
 
 def test_unknown_units_and_axes_are_refused(tmp_path: Path, ball: Surface) -> None:

@@ -160,7 +160,7 @@ def test_landmarks_are_read_as_the_file_says_or_in_the_axes_wanted(tmp_path: Pat
     text = "name,x,y,z\nfalciform,10,20,30\ngallbladder, -10, 5, 0\n"
     contents = {"marks.fcsv": FCSV.format(axes=axes), "marks.mrk.json": _markups(axes)}
     path.write_text(contents.get(kind, text))
-    kept, turned = read_landmarks(path, "mm"), read_landmarks(path, "mm", frame="lps")
+    kept, turned = read_landmarks(path, "mm"), read_landmarks(path, "mm", axes="lps")
     assert list(kept) == ["falciform", "gallbladder"]
     assert np.allclose(kept["falciform"], [0.01, 0.02, 0.03], rtol=0, atol=1e-15)
     sign = -1 if axes == "RAS" and kind in contents else 1
@@ -169,7 +169,7 @@ def test_landmarks_are_read_as_the_file_says_or_in_the_axes_wanted(tmp_path: Pat
 
 def test_the_old_number_of_ras_is_understood(tmp_path: Path) -> None:
     (tmp_path / "marks.fcsv").write_text(FCSV.format(axes="0"))
-    assert read_landmarks(tmp_path / "marks.fcsv", frame="lps")["gallbladder"][0] == pytest.approx(0.01, abs=1e-15)
+    assert read_landmarks(tmp_path / "marks.fcsv", axes="lps")["gallbladder"][0] == pytest.approx(0.01, abs=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
@@ -29,6 +30,7 @@ from softtwin.surrogate.umesh import UMesh
 
 Floats = NDArray[np.float64]
 
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
 MODES, BLOCK, GAMMA = 6, 8, 40.0
 COUNTS = {"train": 64, "validation": 16, "test": 16, "calibration": 16}
 
@@ -129,6 +131,12 @@ def closed_form(small_beam: Body) -> ClosedForm:
 @pytest.fixture(scope="session")
 def data(small_beam: Body, tmp_path_factory: pytest.TempPathFactory) -> DataSet:
     return write_data_set(tmp_path_factory.mktemp("closed") / "data.zarr", small_beam)
+
+
+@pytest.fixture(scope="session")
+def write_data() -> Maker:
+    """For bodies of a test's own."""
+    return write_data_set
 
 
 @pytest.fixture

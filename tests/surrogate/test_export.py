@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -145,17 +147,43 @@ def test_damaged_exports_are_refused(copy: Path, tmp_path: Path) -> None:
         ExportedTwin(tmp_path / "nowhere")
 
 
+def test_running_graphs_leaves_torch_unloaded(exported: Path, tmp_path: Path) -> None:
+    """In a process of its own, which predicts and takes a Jacobian."""
+    script = (
+        "import sys\n"
+        "import numpy as np\n"
+        "from softtwin.surrogate.exported import ExportedTwin\n"
+        f"twin = ExportedTwin({str(exported)!r})\n"
+        "moved = twin.solve(np.zeros((twin.nodes, 3)))\n"
+        "jacobian = twin.linearised(np.full(twin.directions.shape[1], 0.01))[1]\n"
+        "print(moved.shape == (twin.nodes, 3), np.abs(jacobian).max() > 0.0, 'onnxruntime' in sys.modules)\n"
+        "print([name for name in ('torch', 'lightning', 'onnx', 'dolfinx', 'petsc4py') if name in sys.modules])\n"
+    )
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    assert told.returncode == 0, told.stderr
+    assert told.stdout.splitlines() == ["True True True", "[]"]
+
+
 def test_wrong_input_is_named(exported: Path, forces: np.ndarray) -> None:
     graphs = ExportedTwin(exported)
     for wrong, message in (
         (forces[0, 1:], r"expected shape \(45, 3\) or \(s, 45, 3\), got \(44, 3\)"),
         (forces[0] * np.nan, "expected finite numbers"),
+        (forces[0].astype(str), r"ExportedTwin\.forces: expected real numbers, got <U\d+"),
+        (forces[0].astype(complex), r"ExportedTwin\.forces: expected real numbers, got complex128"),
+        ([[0.0] * 3] * 44 + [[0.0] * 2], r"ExportedTwin\.forces: .*rows of different lengths"),
         (forces[0] + 1.0, r"at the \d+ nodes that carried load in training"),
     ):
         with pytest.raises(ValueError, match=message):
             graphs.solve(wrong)
-    with pytest.raises(ValueError, match=r"expected 3 finite numbers, got shape \(4,\)"):
-        graphs.linearised(np.zeros(4))
+    for coefficients, message in (
+        (np.zeros(4), r"expected shape \(3,\), got \(4,\)"),
+        (np.full(3, np.inf), "expected finite numbers"),
+        (["1", "2", "3"], "expected real numbers, got <U1"),
+        (np.ones(3, dtype=complex), "expected real numbers, got complex128"),
+    ):
+        with pytest.raises(ValueError, match=rf"ExportedTwin\.coefficients: {message}"):
+            graphs.linearised(coefficients)
 
 
 def test_a_folder_of_something_else_stays(data: DataSet, tmp_path: Path) -> None:

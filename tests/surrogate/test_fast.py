@@ -1,4 +1,4 @@
-"""Single precision, host to host: what the surrogate says, to 1e-6; on a GPU too, where there is one."""
+"""Host to host: what the surrogate says, to 1e-6 or to rounding; on a GPU too, where there is one."""
 
 from __future__ import annotations
 
@@ -7,16 +7,22 @@ import pytest
 import torch
 
 from softtwin.reference.data.dataset import DataSet
-from softtwin.surrogate.fast import FastSurrogate
+from softtwin.surrogate.fast import FastSurrogate, Precision
 from softtwin.surrogate.model import Surrogate
 
-CLOSE = 1e-6
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
+from .conftest import DEVICES
+
+CLOSE = {"single": 1e-6, "double": 1e-12}  # of the largest
+
+
+@pytest.fixture(params=CLOSE)
+def precision(request: pytest.FixtureRequest) -> Precision:
+    return request.param
 
 
 @pytest.fixture(params=DEVICES)
-def fast(request: pytest.FixtureRequest, surrogate: Surrogate) -> FastSurrogate:
-    return FastSurrogate(surrogate, request.param, directions=7, batch=5)
+def fast(request: pytest.FixtureRequest, surrogate: Surrogate, precision: Precision) -> FastSurrogate:
+    return FastSurrogate(surrogate, request.param, directions=7, batch=5, precision=precision)
 
 
 @pytest.fixture
@@ -31,9 +37,9 @@ def test_displacements_alone_and_in_batches(fast: FastSurrogate, surrogate: Surr
     expected = np.stack([surrogate.solve(one).displacement for one in loads])
     size = np.abs(expected).max()
     first = fast.solve(loads[0])
-    assert np.abs(fast.solve_many(loads) - expected).max() < CLOSE * size
+    assert np.abs(fast.solve_many(loads) - expected).max() < CLOSE[fast.precision] * size
     again = np.stack([fast.solve(one) for one in loads])
-    assert np.abs(again - expected).max() < CLOSE * size
+    assert np.abs(again - expected).max() < CLOSE[fast.precision] * size
     np.testing.assert_array_equal(first, again[0])  # what a call returned is not changed by the next
 
 
@@ -44,8 +50,8 @@ def test_jacobians(fast: FastSurrogate, surrogate: Surrogate) -> None:
     state = surrogate.solve((columns @ coefficients).reshape(-1, 3))
     displacement, jacobian = fast.linearised(coefficients)
     expected = state.push(columns)
-    assert np.abs(displacement - state.displacement).max() < CLOSE * np.abs(state.displacement).max()
-    assert np.abs(jacobian - expected).max() < CLOSE * np.abs(expected).max()
+    assert np.abs(displacement - state.displacement).max() < CLOSE[fast.precision] * np.abs(state.displacement).max()
+    assert np.abs(jacobian - expected).max() < CLOSE[fast.precision] * np.abs(expected).max()
 
 
 def test_wrong_input_is_named(surrogate: Surrogate, loads: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,6 +76,8 @@ def test_wrong_input_is_named(surrogate: Surrogate, loads: np.ndarray, monkeypat
     ):
         with pytest.raises(ValueError, match=rf"FastSurrogate\.forces: {message}"):
             many.solve_many(wrong)
+    with pytest.raises(ValueError, match=r"FastSurrogate\.precision: expected one of .*, got 'half'"):
+        FastSurrogate(surrogate, "cpu", precision="half")  # type: ignore[arg-type]
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ValueError, match=r"FastSurrogate\.device: expected a GPU that torch can use, found none"):
         FastSurrogate(surrogate, "cuda")

@@ -22,7 +22,7 @@ SETTINGS: dict[str, Architecture] = {
     "reduced": Reduced(modes=6, width=24, depth=2),
     "reduced, no symmetries": Reduced(modes=6, width=24, depth=2, symmetries=False),
     "mlp": Perceptron(),
-    "mlp, 20 wide": Perceptron(width=20),
+    "mlp, 20 wide, tanh": Perceptron(width=20, activation="tanh"),
     "transolver": Transolver(width=16, depth=2, heads=2, slices=4),
     "umesh": UMesh(channels=4, levels=2),
     "umesh, numbered along the long axis": UMesh(channels=4, levels=1, numbering="long"),
@@ -83,6 +83,18 @@ def test_derivatives_are_those_of_differences(network: Network, point: torch.Ten
     pushed = network.linearised(point).push(tangent)[:, 0]
     # the step's square, and round-off over the step
     assert ((ahead - behind) / (2.0 * step) - pushed).abs().max() < 1e-7 * pushed.abs().max()
+
+
+def test_pulled_gradients_are_those_of_differences(network: Network, point: torch.Tensor) -> None:
+    """Along the gradient itself, where its size is what differences say, and across it."""
+    step, size = 1e-6, float(point.abs().max())
+    cotangent = _drawn(len(network.linearised(point).values))
+    pulled = network.linearised(point).pull(cotangent)
+    across = _drawn(len(point))
+    for way in (pulled / torch.linalg.vector_norm(pulled), across / torch.linalg.vector_norm(across)):
+        ahead, behind = (network((point + sign * step * size * way)[None])[0] for sign in (1.0, -1.0))
+        found = float((ahead - behind) @ cotangent) / (2.0 * step * size)
+        assert abs(found - float(pulled @ way)) < 1e-7 * float(torch.linalg.vector_norm(pulled))
 
 
 def test_a_batch_is_its_points(network: Network, point: torch.Tensor) -> None:

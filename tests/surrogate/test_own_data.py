@@ -111,8 +111,14 @@ WRONG: dict[str, tuple[Any, dict[str, Any], str]] = {
     "nan": (lambda b, u: (b, _changed(u, (2, 5, 0), np.nan)), {}, r"\.displacements: expected finite.* got 1 samples"),
     "counts": (lambda b, u: (b[1:], u), {}, r"as many forces as displacements, got 159 and 160"),
     "unit": (lambda b, u: (b, 1e3 * u), {}, r"\.length_unit: .* are they in another unit\?"),
-    "no unit": (lambda b, u: (b, u), {"length_unit": "inch"}, r"\.length_unit: expected one of m, cm, mm, got 'inch'"),
-    "no force unit": (lambda b, u: (b, u), {"force_unit": "lbf"}, r"\.force_unit: expected one of N, mN, kN"),
+    "nothing said": (lambda b, u: (b, u), {"length_unit": None, "force_unit": None}, r"\.force_unit: .* got none"),
+    "no length unit": (lambda b, u: (b, u), {"length_unit": None}, r"\.length_unit: expected one of m, .*, got none"),
+    "another unit": (
+        lambda b, u: (b, u),
+        {"length_unit": "inch"},
+        r"\.length_unit: expected one of m, cm, mm, got 'inch'",
+    ),
+    "another force unit": (lambda b, u: (b, u), {"force_unit": "lbf"}, r"\.force_unit: expected one of N, mN, kN"),
     "zeros": (lambda b, u: (0 * b, 0 * u), {}, "got zeros alone"),
     "reactions": (lambda b, u: (_changed(b, (slice(None), 0), 0.1), u), {}, r"\.forces: .*reactions are not part"),
     "attachment": (lambda b, u: (b, u + 0.01), {}, r"\.displacements: expected fixed nodes at rest"),
@@ -134,6 +140,12 @@ def test_what_cannot_be_is_refused_and_nothing_is_written(
     change, options, message = WRONG[name]
     with pytest.raises(ValueError, match=message):
         made(tmp_path, small_beam, change(*arrays), **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_units_have_no_default(tmp_path: Path, small_beam: Body, arrays: Any) -> None:
+    with pytest.raises(ValueError, match=r"data_set_from_arrays\.force_unit: expected one of N, mN, kN, got none"):
+        data_set_from_arrays(tmp_path / "data.zarr", small_beam, *arrays)
     assert list(tmp_path.iterdir()) == []
 
 

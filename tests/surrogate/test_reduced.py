@@ -11,8 +11,8 @@ import torch
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.data.dataset import DataSet
-from softtwin.reference.data.jacobians import prepare_jacobians, stored_modes, write_jacobians
+from softtwin.reference.data.dataset import DataSet, DataSetError
+from softtwin.reference.data.jacobians import prepare_jacobians, read_jacobians, stored_modes, write_jacobians
 from softtwin.surrogate import reduced as reduced_module
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
@@ -233,6 +233,20 @@ def test_jacobians_are_learned_from(differentiated: DataSet, data: DataSet) -> N
 
     without, with_jacobians = (train(differentiated, plan) for plan in plans)
     assert error(with_jacobians) < 0.6 * error(without)
+
+
+@pytest.mark.parametrize("name", ["values", "squares"])
+def test_jacobians_that_are_not_finite_are_refused(differentiated: DataSet, name: str) -> None:
+    """Their checksum is right: nothing was damaged on the way."""
+    draws = differentiated.samples("train").draws
+    stored, size = read_jacobians(differentiated, draws), differentiated.header["block"]
+    assert stored is not None
+    arrays = {"values": np.zeros((size, 6, 6)), "squares": np.ones(size)}
+    arrays[name].flat[0] = np.nan
+    write_jacobians(differentiated.path, 0, arrays["values"], arrays["squares"])
+    assert draws[0] == 0
+    with pytest.raises(DataSetError, match=rf"Jacobians: expected finite numbers in .*, got 1 of {len(draws)} samples"):
+        train(DataSet(differentiated.path), TrainingPlan(Reduced(modes=6, width=16), epochs=1))
 
 
 def test_fewer_modes_than_the_jacobians_are_of_are_refused(differentiated: DataSet) -> None:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import (
     Energy,
@@ -21,6 +22,8 @@ from softtwin.reference.data.materials import (
 )
 from softtwin.surrogate.residual import ElasticBody
 
+from .conftest import DEVICES
+
 LAWS: dict[str, Material] = {
     "linear": LinearElastic(4500.0, 0.3),
     "Saint-Venant-Kirchhoff": SaintVenantKirchhoff(4500.0, 0.45),
@@ -32,6 +35,8 @@ KINDS = ["tetrahedron", "hexahedron"]
 
 
 def body_of(kind: str, degree: int = 1, curved: bool = False) -> Body:
+    if kind == "gridded":  # hexahedra whose cut cells count with their filled part
+        return gridded(beam((3, 2, 2), (1.0, 0.25, 0.25), "tetrahedron"), 0.11)
     made = beam((3, 2, 2), (1.0, 0.25, 0.25), "tetrahedron" if kind == "tetrahedron" else "hexahedron")
     made = made.quadratic() if degree == 2 else made
     points = made.points + 0.01 * np.sin(7.0 * made.points[:, [1, 2, 0]]) if curved else made.points
@@ -42,6 +47,10 @@ def some_displacement(body: Body, rng: np.random.Generator, size: float = 0.02) 
     return size * np.sin(5.0 * body.points @ rng.standard_normal((3, 3)))
 
 
+def only(fields: Tensor, i: int) -> Tensor:
+    return fields[i : i + 1]
+
+
 def batch(*fields: np.ndarray) -> Tensor:
     return torch.from_numpy(np.stack(fields))
 
@@ -49,23 +58,31 @@ def batch(*fields: np.ndarray) -> Tensor:
 @pytest.mark.fenicsx
 @pytest.mark.parametrize("law", LAWS.values(), ids=list(LAWS))
 @pytest.mark.parametrize(
-    ("kind", "degree", "curved"), [(k, d, c) for k in KINDS for d, c in ((1, False), (2, False), (2, True))]
+    ("kind", "degree", "curved"),
+    [(k, d, c) for k in KINDS for d, c in ((1, False), (2, False), (2, True))] + [("gridded", 1, False)],
 )
-def test_energy_and_forces_are_the_references(law: Material, kind: str, degree: int, curved: bool, rng) -> None:
+def test_energy_forces_and_residual_are_the_references(
+    law: Material, kind: str, degree: int, curved: bool, rng
+) -> None:
     from softtwin.reference.solve.problem import Problem
 
     body = body_of(kind, degree, curved)
-    weights = rng.uniform(0.3, 1.0, len(body.cells))
+    weights = None if kind == "gridded" else rng.uniform(0.3, 1.0, len(body.cells))
+    assert (kind == "gridded") == (body.fractions is not None and body.fractions.min() < 0.9)
     fields = [some_displacement(body, rng) for _ in range(2)]
     physics = ElasticBody(body, law, weights)
     energies, forces = physics.energy(batch(*fields)).numpy(), physics.internal_forces(batch(*fields)).numpy()
+    loads = [np.abs(forces).max() * rng.standard_normal(body.points.shape) for _ in fields]
+    residuals = physics.residual(batch(*fields), batch(*loads)).numpy()
     with Problem(body, law, weights=weights) as problem:
         stiffness = problem.stiffness(fields[0])
         free = np.repeat(np.isin(np.arange(len(body.points)), body.free), 3)
         found = physics.stiffness(torch.from_numpy(fields[0]))[free][:, free]
         assert abs(found - stiffness[free][:, free]).max() < 1e-10 * abs(stiffness).max()
-        for field, energy, force in zip(fields, energies, forces, strict=True):
+        for field, load, energy, force, residual in zip(fields, loads, energies, forces, residuals, strict=True):
             expected = problem.internal_forces(field)
+            missing = (expected - load)[body.free]
+            assert residual == pytest.approx(np.linalg.norm(missing) / np.linalg.norm(load[body.free]), rel=1e-10)
             assert energy == pytest.approx(problem.energy(field), rel=1e-10)
             np.testing.assert_allclose(force, expected, atol=1e-10 * np.abs(expected).max())
 
@@ -121,6 +138,26 @@ def test_a_rigid_motion_costs_nothing_but_in_the_linear_law(law: Material) -> No
     energies = ElasticBody(body, law).energy(batch(np.zeros_like(moved), np.full_like(moved, 0.3), moved)).numpy()
     np.testing.assert_allclose(energies[:2], 0.0, atol=1e-10)
     assert (abs(energies[2]) > 1.0) == isinstance(law, LinearElastic)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_batch_on_any_device_is_its_samples_on_the_cpu(device: str, rng) -> None:
+    body = body_of("hexahedron")
+    u = batch(*(some_displacement(body, rng) for _ in range(3)))
+    b = batch(*(rng.standard_normal(body.points.shape) for _ in range(3)))
+    alone, physics = (ElasticBody(body, LAWS["Neo-Hookean"]) for _ in range(2))
+    physics = physics.to(device)
+    sent = u.to(device), b.to(device)
+    for found, one in (
+        (physics.energy(sent[0]), lambda i: alone.energy(only(u, i))),
+        (physics.internal_forces(sent[0]), lambda i: alone.internal_forces(only(u, i))),
+        (physics.residual(*sent), lambda i: alone.residual(only(u, i), only(b, i))),
+    ):
+        assert found.device.type == device
+        expected = torch.cat([one(i) for i in range(3)])
+        assert (found.cpu() - expected).abs().max() < 1e-12 * expected.abs().max()
+    stiffness = alone.stiffness(u[0])
+    assert abs(physics.stiffness(sent[0][0]) - stiffness).max() < 1e-12 * abs(stiffness).max()
 
 
 def test_a_cell_inside_out_shows(rng) -> None:

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from softtwin.meshes.body import Body, Surface
-from softtwin.meshes.grid import sparse_grid
+from softtwin.meshes.grid import SparseGrid, sparse_grid
 from softtwin.meshes.shapes import beam
+from softtwin.reference.data.dataset import DataSet
+from softtwin.surrogate import twin
+from softtwin.surrogate.evaluate import evaluate
+from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.train import train
 from softtwin.surrogate.umesh import UMesh, UMeshNetwork, lattice, tensor_places
 
 
@@ -18,11 +26,16 @@ def test_a_beam_fills_its_grid(small_beam: Body) -> None:
     assert np.abs(small_beam.points - (small_beam.points.min(axis=0) + 0.1 * positions)).max() < 1e-12
 
 
-def test_the_cells_of_a_sparse_grid_keep_their_places() -> None:
+def turned_box(spacing: float) -> SparseGrid:
+    """The grid around a box that lies across it, whose corners stay empty."""
     box = beam((4, 2, 2), (0.4, 0.2, 0.2), "tetrahedron")
     used, corners = np.unique(box.boundary, return_inverse=True)
     turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
-    grid = sparse_grid(Surface(box.points[used] @ turn.T, corners.reshape(-1, 3)), [0], spacing=0.05)
+    return sparse_grid(Surface(box.points[used] @ turn.T, corners.reshape(-1, 3)), [0], spacing=spacing)
+
+
+def test_the_cells_of_a_sparse_grid_keep_their_places() -> None:
+    grid = turned_box(0.05)
     positions, shape = lattice(grid.body)
     assert np.array_equal(positions, grid.node_index) and shape == tuple(np.add(grid.shape, 1))
     assert len(positions) < np.prod(shape)
@@ -92,6 +105,44 @@ def test_the_grid_is_padded_to_what_the_levels_halve(small_beam: Body) -> None:
     network.falls[3].register_forward_hook(lambda module, inputs, values: seen.append(tuple(values.shape)))
     network(torch.zeros(2, 12))
     assert seen == [(2, 16, 1, 1, 1)]
+
+
+@pytest.fixture(scope="module")
+def sparse(write_data: Any, tmp_path_factory: pytest.TempPathFactory) -> DataSet:
+    return write_data(tmp_path_factory.mktemp("sparse") / "data.zarr", turned_box(0.08).body)
+
+
+def test_what_the_grid_holds_outside_of_the_body_is_not_learned_from(sparse: DataSet) -> None:
+    """A masked loss: neither its value nor its derivative knows of the tensor where no node stands."""
+    samples = sparse.samples("train")
+    lesson = UMesh(channels=3, levels=1).lesson(sparse, samples, samples)
+    positions, shape = lattice(sparse.body)
+    assert len(positions) < 0.9 * np.prod(shape)
+    added: list[torch.Tensor] = []
+    lesson.network.leave.register_forward_hook(lambda module, inputs, values: values + added[0] if added else values)
+    batch = torch.arange(4)
+    plain = lesson.loss(batch).detach()
+    padded = [size + size % 2 for size in shape]
+    field = torch.zeros(4, 3, *padded, requires_grad=True)
+    added.append(field)
+    (slope,) = torch.autograd.grad(lesson.loss(batch), field)
+    occupied = torch.zeros(padded, dtype=torch.bool)
+    occupied[tuple(torch.from_numpy(positions).T)] = True
+    assert bool((slope[..., ~occupied] == 0.0).all()) and bool((slope[..., occupied] != 0.0).all())
+    added[0] = torch.where(occupied, 0.0, 1e3).expand_as(field)
+    assert torch.equal(lesson.loss(batch).detach(), plain)
+
+
+def test_a_body_on_a_sparse_grid_is_learned_and_predicted(sparse: DataSet, tmp_path: Path) -> None:
+    surrogate = train(sparse, TrainingPlan(UMesh(channels=12, levels=2), batch=8, epochs=30))
+    assert evaluate(surrogate, sparse).relative_error.median < 0.7  # 1 for a prediction of nothing
+    forces = np.zeros_like(sparse.body.points)
+    forces[sparse.response.loaded] = sparse.samples("test").forces[0]
+    state = surrogate.solve(forces)
+    assert state.displacement.shape == sparse.body.points.shape
+    twin.save(surrogate, tmp_path)
+    again = twin.load(tmp_path, sparse.body).solve(forces)
+    np.testing.assert_array_equal(again.displacement, state.displacement)
 
 
 @pytest.mark.parametrize(
