@@ -395,6 +395,27 @@ class Conditions:
         return None
 
     @property
+    def has_regions(self) -> bool:
+        """Whether the stiffness of a part of the body is an unknown of its own."""
+        return any(isinstance(unknown, Stiffness) and unknown.cells is not None for unknown in self.unknowns)
+
+    def shares(self, direction: Floats) -> Floats:
+        """How far each unknown's own value goes along a direction of the coefficients, in its deviations beforehand.
+
+        They are the direction itself, but for a region beside the whole body: its modulus grows with both.
+
+        Args:
+            direction: (count,).
+        """
+        found, begin, modulus = direction.copy(), 0, self.modulus
+        for unknown in self.unknowns:
+            if isinstance(unknown, Stiffness) and modulus is not None and unknown.cells is not None:
+                both = np.array([unknown.deviation, modulus[1]])
+                found[begin] = both @ direction[[begin, modulus[0]]] / np.linalg.norm(both)
+            begin += unknown.count
+        return found
+
+    @property
     def has_forces_alone(self) -> bool:
         """Whether every forward model takes them."""
         return all(unknown.is_force for unknown in self.unknowns)

@@ -14,6 +14,7 @@ from softtwin.meshes.metrics import displacement_gradients
 from .evidence import Scale
 from .forward import ForwardModel, State
 from .gauss_newton import Found
+from .identifiability import untold
 from .outcome import Outcome
 from .problem import Problem
 
@@ -66,7 +67,8 @@ class Expectations:
         pose: largest move of the pose in deviations of its prior.
         condition: the same of stiffness and other unknowns beside the forces.
         gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
-        told: least part of such an unknown's variance that a cloud must take away where all forces are known.
+        told: least part of the variance of such an unknown, and of every combination of them, that a cloud must take
+            away where all forces are known.
     """
 
     noise: float
@@ -272,9 +274,21 @@ def _of_the_conditions(problem: Problem, found: Found, expected: Expectations) -
             findings.append(
                 (Verdict.DOUBTFUL, f"{known.name} lies {known.deviations:.1f} deviations from where it was expected")
             )
-        if known.told < expected.told and is_asked_for:
-            findings.append(
-                (Verdict.DOUBTFUL, f"the cloud does not tell {known.name} under this load: what is given is what was "
-                                   "expected beforehand")
-            )  # fmt: skip
-    return findings
+    return findings + (_of_what_is_untold(problem, found, expected) if is_asked_for else [])
+
+
+def _of_what_is_untold(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
+    """Unknowns, and combinations of them, of which the cloud has left most of what was believed beforehand."""
+    conditions, part = problem.conditions, problem.condition_part
+    assert conditions is not None
+    covariance = found.posterior.covariance[part, part]
+    names = [known.name for known in conditions.estimates(found.trial.coefficients[part], covariance)]
+    if conditions.has_regions:
+        names = [f"{name} of the rest" if name == "Young's modulus" else name for name in names]
+    alone, combined = untold(conditions, names, covariance, expected.told)
+    given = "what is given is what was expected beforehand"
+    same = "other values that differ so would explain it as well"
+    return [
+        *((Verdict.DOUBTFUL, f"the cloud does not tell {name} under this load: {given}") for name in alone),
+        *((Verdict.DOUBTFUL, f"the cloud does not tell {names} under this load: {same}") for names in combined),
+    ]
