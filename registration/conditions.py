@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 LEAST_MODULUS = 10.0  # pascals: nothing softer is an organ
 LOWEST_RATIO, HIGHEST_RATIO = 0.2, 0.5  # open ends (Odot 2023, figure 7.27)
-_DEVIATIONS = 1.6449  # of a normal law: 90 % lie within
+WITHIN_90 = 1.6449  # deviations of a normal law that hold 90 %
 _STRIDE = {"modulus": np.log(10.0), "ratio": 1.5, "turn": 0.3}  # largest change in one step
 
 
@@ -488,6 +488,6 @@ def estimate(name: str, unit: str, at: Callable[[float], float], mean: float, va
         mean: of the coefficient, whose variance beforehand is 1.
         variance: of it.
     """
-    reach = _DEVIATIONS * np.sqrt(max(variance, 0.0))
+    reach = WITHIN_90 * np.sqrt(max(variance, 0.0))
     told = float(np.clip(1.0 - variance, 0.0, 1.0))
     return Estimate(name, unit, at(mean), (at(mean - reach), at(mean + reach)), told, float(abs(mean)))

@@ -181,11 +181,31 @@ def test_every_frame_is_written_with_its_verdict(plain_twin: Twin, cloud, forces
     assert np.allclose(first["pose"], np.eye(4))
     deviations = np.sqrt(np.diag(first["net_force_covariance_N2"]))
     np.testing.assert_allclose(deviations, first["net_force_deviation_N"], rtol=1e-12)
+    middle, reach = np.mean(first["net_force_90_N"], axis=1), 0.5 * np.diff(first["net_force_90_N"], axis=1)[:, 0]
+    np.testing.assert_allclose(middle, first["net_force_N"], atol=1e-12)
+    np.testing.assert_allclose(reach, 1.6449 * deviations, rtol=1e-9)
+    assert f", {first['informed']:.0f} directions seen" in lines[0] and first["informed"] > 1.5
     assert second["verdict"] == "refused" and "empty" in second["reasons"][0] and second["files"] == []
     assert third["evaluations"] < first["evaluations"]
     assert lines[0].startswith("frame   0: accepted, cloud to surface 0.")
     assert lines[1] == "frame   1: refused (cloud: expected at least one point, got an empty cloud.)"
     assert len(rows) == 3
+
+
+def test_forces_over_stiffness_are_no_less_known_where_the_stiffness_is_not(plain_twin: Twin, cloud, tmp_path) -> None:
+    """The prior of the modulus is what newtons are worth: it is in their interval, and not in what the cloud tells."""
+    rows = []
+    for deviation in (0.0, 0.3):
+        material = {"young_modulus": 4000.0, "young_modulus_deviation": deviation}
+        config = Config.model_validate({"material": material, "registration": {"zone": "tip"}})
+        twin = Twin(plain_twin.model, config)
+        rows.append(register_clouds(twin, [cloud], tmp_path / f"{deviation}", say=lambda line: None)[0])
+    sharp, wide = rows
+    np.testing.assert_allclose(wide["net_force_over_modulus_m2"], np.array(wide["net_force_N"]) / 4000.0, rtol=1e-12)
+    for name in ("net_force_over_modulus_m2", "net_force_over_modulus_deviation_m2"):
+        np.testing.assert_allclose(wide[name], sharp[name], rtol=1e-6)
+    assert np.ptp(wide["net_force_90_N"][2]) > 2.0 * 1.6449 * 0.3 * abs(wide["net_force_N"][2])
+    assert np.ptp(sharp["net_force_90_N"][2]) < 0.5 * np.ptp(wide["net_force_90_N"][2])
 
 
 def test_clouds_that_hold_nothing_usable_are_refused_frames(plain_twin: Twin, cloud, tmp_path: Path) -> None:
@@ -265,6 +285,8 @@ def test_figures_are_on_the_axes_of_the_twins_files(plain_twin: Twin, cloud, for
     turned = register_clouds(twin, [seen], tmp_path / "ras", camera=known, say=lambda line: None)[0]
     flip = np.array([-1.0, -1.0, 1.0])
     np.testing.assert_allclose(turned["net_force_N"], flip * plain["net_force_N"], rtol=1e-12)
+    middle = np.mean(turned["net_force_90_N"], axis=1)
+    np.testing.assert_allclose(middle, turned["net_force_N"], rtol=1e-9)
     covariance = flip[:, None] * np.array(plain["net_force_covariance_N2"]) * flip
     np.testing.assert_allclose(turned["net_force_covariance_N2"], covariance, rtol=1e-12)
     point = np.array([0.1, 0.2, 0.3])
