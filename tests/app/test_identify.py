@@ -13,7 +13,7 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.app.cli import softtwin
 from softtwin.app.config import ConfigError, parse_config
-from softtwin.app.unknowns import Unknown, UnknownError
+from softtwin.app.unknowns import Unknown, UnknownError, priors_taken
 from softtwin.meshes.files import read_body
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.solve.problem import Loading, Problem
@@ -63,7 +63,7 @@ def test_stiffness_and_ratio_from_several_clouds(folder: Path, tmp_path: Path) -
     code, said, record = identified(folder, tmp_path, *clouds, *known, *unknown)
     assert code == 0, said
     assert "of 3 clouds 3 could be used" in said
-    assert "net force" not in said
+    assert "net force" not in said and "taken" not in said
     modulus, ratio = record["together"]
     for estimate, truth in ((modulus, TRUE_MODULUS), (ratio, TRUE_RATIO)):
         low, high = estimate["interval"]
@@ -95,7 +95,20 @@ def test_forces_and_stiffness_together_carry_the_prior(folder: Path, tmp_path: P
     (modulus,) = frame["estimates"]
     assert modulus["interval"][0] < TRUE_MODULUS < modulus["interval"][1]
     assert len(frame["net_force_over_modulus_m2"]) == 3
-    assert "Young's modulus" in said
+    assert "Young's modulus" in said and "taken" not in said
+
+
+def test_forces_and_stiffness_without_a_prior_say_which_was_taken(folder: Path, tmp_path: Path) -> None:
+    words = ["--engine", "reference", "--unknown", "young-modulus", "--output", tmp_path]
+    code, said = run("register", folder / "organ.toml", folder / "cloud_0.npy", *words)
+    assert code == 0, said
+    first = said.splitlines()[0]
+    assert first == "young-modulus: prior of ±50 % taken, and forces are known no better; say young-modulus=DEVIATION"
+    (frame,) = json.loads((tmp_path / "registration.json").read_text())["frames"]
+    force, doubt = frame["net_force_N"], frame["net_force_deviation_N"]
+    assert np.linalg.norm(doubt) > 0.3 * np.linalg.norm(force)  # newtons are worth that prior
+    assert priors_taken(("young-modulus=0.5", "poisson-ratio")) == []
+    assert "young-modulus@tumour: prior of" in priors_taken(("young-modulus@tumour",))[0]
 
 
 def test_one_contact(folder: Path, tmp_path: Path) -> None:
