@@ -146,7 +146,13 @@ def test_a_network_takes_no_other_stiffness() -> None:
         parse_config({"registration": {"unknowns": ["young-modulus"]}})
     with pytest.raises(ConfigError, match=r"registration\.model: expected reference with these unknowns"):
         parse_config({"registration": {"model": "hybrid", "gravity": [0.0, 0.0, -9.81]}})
+    with pytest.raises(ConfigError, match=r"registration\.model: expected reference or hybrid with these unknowns"):
+        parse_config({"registration": {"known_forces": "forces.npy"}})
+    with pytest.raises(ConfigError, match=r"registration\.model: expected reference with these unknowns"):
+        known = {"unknowns": ["young-modulus"], "forces": "known"}  # nothing is left for a network to find
+        parse_config({"registration": {"model": "hybrid", **known}})
     parse_config({"registration": {"unknowns": ["contact"]}})
+    parse_config({"registration": {"model": "hybrid", "known_forces": "forces.npy"}})
 
 
 @pytest.mark.parametrize("text", ["young-modulus@", "=3", "moved@a=b", "contact=nan"])
