@@ -435,6 +435,12 @@ class Twin:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
         loaded = loaded_nodes(body, load_plan(self.config))
         nodes = None if section.forces == "known" else body.node_sets[zone] if zone else loaded
+        conditions = self._conditions(model)
+        if nodes is not None and conditions is not None and not len(np.setdiff1d(nodes, conditions.moved)):
+            raise ConfigError(
+                f"registration.zone: expected nodes that may carry force, got {zone or 'loaded nodes'}, all of which "
+                "moved@ holds; what is moved carries none. Give another zone."
+            )
         return prepare(
             model,
             nodes,
@@ -443,7 +449,7 @@ class Twin:
             smoothness=section.smoothness,
             directions=section.directions,
             options=_options(section, options_for(model, bool(zone))),
-            conditions=self._conditions(model),
+            conditions=conditions,
             modulus_deviation=self.config.material.young_modulus_deviation,
             elsewhere=loaded if zone else None,
         )

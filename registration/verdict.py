@@ -24,6 +24,7 @@ _ASKED = 250  # points at least, whose neighbours are looked at
 _MARK_OFF = 4.0  # deviations of a landmark's place; three axes together are beyond it once in a thousand
 _LEANING = 3.0  # times what normals of the deviation that was told would be off by in the median
 _FEWEST_POINTS = 30
+_MUCH, _THIN, _ABOUT = 0.2, 0.05, 8  # share of the points that fit nowhere, thickness of a surface, neighbours for that
 _SMALL, _NEARLY_ALL = 0.1, 95.0  # turn (radians) or stretch that a linear law holds for; per cent of the cells
 
 
@@ -173,6 +174,11 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
     outliers = float(np.mean(found.weights < 0.05))
     if outliers > expected.outliers:
         findings.append((Verdict.DOUBTFUL, f"{100 * outliers:.0f} % of the points fit nowhere"))
+    elif outliers > _MUCH and thickness(found.trial.cloud[found.weights < 0.05]) < _THIN:
+        findings.append(
+            (Verdict.DOUBTFUL, f"{100 * outliers:.0f} % of the points are a surface that is none of this organ's: "
+                               "something else is in the cloud")
+        )  # fmt: skip
     return findings
 
 
@@ -204,6 +210,22 @@ def shared(feet: Floats, distances: Floats, weights: Floats) -> float:
     _, near = cKDTree(points).query(points[asked], k=count + 1)
     beside = values[near[:, 1:]].mean(axis=1)
     return float(np.clip((values[asked] * beside).mean() / (values**2).mean(), 0.0, 1.0))
+
+
+def thickness(points: Floats) -> float:
+    """Part of the spread about a point that is across its neighbours' plane, median: 0 of a surface, 0.1 of a space.
+
+    Surface variation (Pauly, Gross and Kobbelt 2002).
+
+    Args:
+        points: (p, 3), metres.
+    """
+    if len(points) <= _ABOUT:
+        return 1.0
+    _, near = cKDTree(points).query(points, k=_ABOUT + 1)
+    arms = points[near] - points[near].mean(axis=1, keepdims=True)
+    squares = np.linalg.svd(arms, compute_uv=False) ** 2
+    return float(np.median(squares[:, 2] / np.maximum(squares.sum(axis=1), 1e-300)))
 
 
 def _of_the_normals(problem: Problem, found: Found) -> list[_Finding]:

@@ -24,7 +24,7 @@ from softtwin.app.twin import Twin
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import FileError, read_body
+from softtwin.meshes.files import FileError, read_body, write_body
 from softtwin.registration.pose import Pose
 from softtwin.registration.unknowns import PosePrior
 
@@ -361,6 +361,9 @@ def test_strict_ends_with_code_3(capsys, mesh_folder: Path, mesh_cloud: Path) ->
         (("--zone", "nowhere"), "registration.zone: expected one of"),
         (("--format", "xyz"), "--format: expected vtu, stl, ply, vtp, got xyz"),
         (("--noise", "-1"), "registration.noise"),
+        (("--pose", "unknown", "--pose-turn", "0"), "registration.pose_turn: Input should be greater than 0"),
+        (("--pose", "unknown", "--pose-shift", "0"), "registration.pose_shift: Input should be greater than 0"),
+        (("--zone", "tip", "--unknown", "moved@tip"), "got tip, all of which moved@ holds"),
         (("--truth", "cloud.npy"), "--truth: expected shape"),
         (("--align", "auto", "--start", "cloud.npy"), "expected one of them"),
         (("--start", "cloud.npy"), "cloud.npy"),
@@ -383,6 +386,38 @@ def test_a_cloud_that_cannot_be_is_refused_with_its_file(capsys, mesh_folder: Pa
     np.save(mesh_folder / "bad.npy", points)
     said = register(capsys, mesh_folder, mesh_folder / "bad.npy", code=2)
     assert "bad.npy" in said and message in said and "Traceback" not in said
+
+
+PLY = "ply\nformat {} 1.0\nelement vertex 50\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+
+
+@pytest.mark.parametrize("kind", ["npy", "ascii", "binary_little_endian"])
+@pytest.mark.parametrize("part", [0.05, 0.5, 0.95])
+def test_a_cloud_that_is_cut_is_said_to_be_truncated(capsys, mesh_folder: Path, kind: str, part: float) -> None:
+    points = np.random.default_rng(0).random((50, 3)).astype("<f4")
+    path = mesh_folder / ("cut.npy" if kind == "npy" else "cut.ply")
+    if kind == "npy":
+        np.save(path, points)
+    else:
+        rows = points.tobytes() if kind != "ascii" else "".join(f"{x} {y} {z}\n" for x, y, z in points).encode()
+        path.write_bytes(PLY.format(kind).encode() + rows)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(part * len(whole))])
+    said = register(capsys, mesh_folder, path, code=2)
+    assert path.name in said and "truncated" in said and "Traceback" not in said
+
+
+def test_a_support_without_a_free_node_is_said(capsys, mesh_folder: Path, mesh_cloud: Path, seen_body: Body) -> None:
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    write_body(mesh_folder / "body.vtu", seen_body.with_sets(fixed=seen_body.boundary_nodes))
+    said = register(capsys, mesh_folder, mesh_cloud, code=2)
+    assert "Body.fixed: expected free nodes on the boundary, got all" in said and "nothing is left" in said
+
+
+def test_a_camera_inside_the_organ_is_asked_about(capsys, mesh_folder: Path, tmp_path: Path) -> None:
+    words = ("--fixed", "halfspace:0.001,0,0:-1,0,0", "--observed", "seen-from:0.15,0.03,0.03")
+    said = run(capsys, "build", mesh_folder / "body.vtu", *words, "--output", tmp_path / "made", code=2)
+    assert "seen from (150, 30, 30) mm" in said and "is the camera inside?" in said
 
 
 def test_a_cloud_one_metre_away_is_refused_with_the_distance(capsys, mesh_folder: Path, mesh_cloud: Path) -> None:
