@@ -347,6 +347,22 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
     assert {path.suffix for path in (mesh_folder / "found").iterdir()} == {".json", ".ply", ".stl"}
 
 
+def test_a_budget_bounds_each_frame_of_a_sequence(capsys, mesh_folder: Path, mesh_cloud: Path) -> None:
+    """No time at all: where each search begins, and said so; time enough: as without a budget."""
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    frames = []
+    for budget in ("1e-9", "600"):
+        said = register(capsys, mesh_folder, mesh_cloud, mesh_cloud, "--budget", budget)
+        frames.append(record_of(mesh_folder / "found")["frames"])
+        assert ("the time for it was over" in said) == (budget == "1e-9")
+    short, long = frames
+    assert [frame["verdict"] for frame in short] == ["doubtful"] * 2
+    assert [frame["outcome"] for frame in short + long] == ["out_of_time"] * 2 + ["converged"] * 2
+    assert short[0]["evaluations"] < long[0]["evaluations"] and short[0]["rms_distance_m"] > long[0]["rms_distance_m"]
+    said = register(capsys, mesh_folder, mesh_cloud, "--budget", 0, code=2)
+    assert "--budget: expected a positive time in seconds, got 0.0" in said
+
+
 def test_strict_ends_with_code_3(capsys, mesh_folder: Path, mesh_cloud: Path) -> None:
     pytest.importorskip("petsc4py", reason="FEniCSx is absent")
     np.save(mesh_folder / "empty.npy", np.empty((0, 3)))
