@@ -289,8 +289,10 @@ class RegistrationSection(_Section):
         models = ["surrogate", "reference"] if kinds and not others else ["surrogate", "reference", "hybrid"]
         if others:  # a network has learned one material
             models = ["reference", "hybrid"]
-        if self.known_forces or any(self.gravity) or self.pressure or "moved" in kinds:  # one support, and forces alone
-            models = ["reference"]
+        if self.known_forces:  # they are added to those that the network is asked for, where both engines know of them
+            models = [model for model in models if model != "surrogate"]
+        if any(self.gravity) or self.pressure or "moved" in kinds or self.forces == "known":
+            models = ["reference"]  # a network has one support, and no load inside or that follows the surface
         if self.model not in models:
             raise ValueError(
                 f"registration.model: expected {' or '.join(models)} with these unknowns and known loads (a network "

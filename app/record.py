@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.metrics import target_errors
+from softtwin.registration.conditions import WITHIN_90
 from softtwin.registration.registrar import Registration
 from softtwin.registration.verdict import Verdict
 
@@ -111,12 +112,14 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
     """
     place = twin.coordinates
     turned = place.directions(np.eye(3))
+    net, doubt = place.directions(result.net_force), result.net_force_deviation
     row: dict[str, Any] = {
         "outcome": result.outcome.name.lower(),
         "rms_distance_m": result.rms_distance,
         "noise_m": result.noise,
-        "net_force_N": place.directions(result.net_force).tolist(),
-        "net_force_deviation_N": result.net_force_deviation.tolist(),
+        "net_force_N": net.tolist(),
+        "net_force_deviation_N": doubt.tolist(),
+        "net_force_90_N": np.stack([net - WITHIN_90 * doubt, net + WITHIN_90 * doubt], axis=1).tolist(),
         "net_force_covariance_N2": (turned @ result.net_force_covariance @ turned).tolist(),
         "force_scale_N": result.force_scale,
         "largest_displacement_m": float(np.linalg.norm(result.displacement, axis=1).max()),
@@ -133,8 +136,8 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
     }
     if result.estimates:
         row["estimates"] = [asdict(estimate) for estimate in result.estimates]
-    if result.force_over_modulus is not None:
-        ratio, deviation = result.force_over_modulus
+    if doubt.any():  # there are unknown forces
+        ratio, deviation = _over_modulus(twin, result)
         row["net_force_over_modulus_m2"] = place.directions(ratio).tolist()
         row["net_force_over_modulus_deviation_m2"] = deviation.tolist()
     if result.draft is not None:  # where the two models of the hybrid engine disagree, and by how much
@@ -171,6 +174,18 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
     return row
 
 
+def _over_modulus(twin: Twin, result: Registration) -> tuple[Floats, Floats]:
+    """Net force over Young's modulus, (3,), square metres, and its deviation: by the configuration's where it is known.
+
+    How well that modulus is known is doubt of the newtons, and none of this.
+    """
+    if result.force_over_modulus is not None:
+        return result.force_over_modulus
+    material, net = twin.config.material, result.net_force
+    variances = np.diag(result.net_force_covariance) - (material.young_modulus_deviation * net) ** 2
+    return net / material.young_modulus, np.sqrt(np.maximum(variances, 0.0)) / material.young_modulus
+
+
 def _mean_length(vectors: Floats) -> float:
     return float(np.linalg.norm(vectors, axis=1).mean())
 
@@ -202,6 +217,7 @@ def describe(row: Mapping[str, Any]) -> str:
     line += (
         f", net force {force:.3f} ± {doubt:.3f} N" if force > 0.0 or doubt > 0.0 else ""
     )  # none where all forces are known
+    line += f", {row['informed']:.0f} directions seen" if math.isfinite(row.get("informed", math.nan)) else ""
     line += "".join(f", {describe_estimate(estimate)}" for estimate in row.get("estimates", ()))
     line += f", {1e3 * row['seconds']:.0f} ms"
     if "age_s" in row:

@@ -30,6 +30,7 @@ from .landmarks import MarkFiles, camera_from_landmarks, describe_landmarks
 from .record import NOTICE as NOTICE
 from .record import Recorder, counts, describe
 from .twin import Camera, Frame, Twin, coordinates_of
+from .unknowns import priors_taken
 
 Floats = NDArray[np.float64]
 CLOUDS = (".npy", ".txt", ".csv", ".xyz", ".ply", ".stl", ".obj", ".vtk", ".vtp", ".vtu", ".pcd")
@@ -283,6 +284,9 @@ class Scene:
         Raises:
             ConfigError, FileError, PoseError, TwinError: what cannot be used, and why.
         """
+        section = twins.with_options(self.home.config, dict(self.options)).registration
+        for line in priors_taken(section.unknowns) if section.forces == "unknown" else ():
+            say(line)
         pose = None
         if start.matrix is not None:
             pose = camera_from_matrix(start.matrix, self.outside)

@@ -116,7 +116,11 @@ def _fill_template(space: Workspace, studio: Studio, sections: Mapping[str, Sect
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     environment.filters.update(
-        figure=figure, mm=lambda metres: "–" if metres is None else figure(1e3 * metres), vector=_vector
+        figure=figure,
+        mm=lambda metres: "–" if metres is None else figure(1e3 * metres),
+        vector=_vector,
+        interval=_interval,
+        mm2=_square_millimetres,
     )
     environment.globals.update(gradient=_gradient, norm=np.linalg.norm)
     environment.globals.update(displacement_colours=DISPLACEMENT, error_colours=_ERROR)
@@ -140,8 +144,21 @@ def figure(value: float) -> str:
     return f"{value:,.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.2e}"
 
 
-def _vector(values: Sequence[float]) -> str:
-    return "(" + ", ".join(f"{value:+.3f}" for value in values) + ")"
+def _vector(values: Sequence[float | None]) -> str:
+    return "(" + ", ".join(map(_signed, values)) + ")"
+
+
+def _square_millimetres(values: Sequence[float | None]) -> str:
+    return "(" + ", ".join("–" if value is None else f"{1e6 * value:+.3g}" for value in values) + ")"
+
+
+def _interval(bounds: Sequence[Sequence[float | None]]) -> str:
+    each = zip("xyz", bounds, strict=True)
+    return ", ".join(f"{axis} {_signed(low)} to {_signed(high)}" for axis, (low, high) in each)
+
+
+def _signed(value: float | None) -> str:
+    return "–" if value is None else f"{value:+.3f}"
 
 
 def _gradient(colours: str) -> str:
@@ -419,6 +436,9 @@ def _figures(body: Body, state: _State, truth: Floats, cloud: Floats, targets: M
         "distance": _cloud_distance(body, state.displacement, cloud),
         "force": force,
         "deviation": state.row.get("net_force_deviation_N"),
+        "interval": state.row.get("net_force_90_N"),
+        "over_modulus": state.row.get("net_force_over_modulus_m2"),
+        "informed": state.row.get("informed"),
         "seconds": state.row.get("seconds"),
         "iterations": state.row.get("iterations"),
         "outcome": str(state.row.get("outcome", "")).replace("_", " "),

@@ -53,7 +53,8 @@ from .workspace import open_workspace
 
 if TYPE_CHECKING:
     from softtwin.surrogate.certificate import Certificate, Certifier
-    from softtwin.surrogate.model import SurrogateState
+    from softtwin.surrogate.loaded import LoadedSurrogate
+    from softtwin.surrogate.model import Surrogate, SurrogateState
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -434,6 +435,12 @@ class Twin:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
         loaded = loaded_nodes(body, load_plan(self.config))
         nodes = None if section.forces == "known" else body.node_sets[zone] if zone else loaded
+        conditions = self._conditions(model)
+        if nodes is not None and conditions is not None and not len(np.setdiff1d(nodes, conditions.moved)):
+            raise ConfigError(
+                f"registration.zone: expected nodes that may carry force, got {zone or 'loaded nodes'}, all of which "
+                "moved@ holds; what is moved carries none. Give another zone."
+            )
         return prepare(
             model,
             nodes,
@@ -442,7 +449,7 @@ class Twin:
             smoothness=section.smoothness,
             directions=section.directions,
             options=_options(section, options_for(model, bool(zone))),
-            conditions=self._conditions(model),
+            conditions=conditions,
             modulus_deviation=self.config.material.young_modulus_deviation,
             elsewhere=loaded if zone else None,
         )
@@ -652,11 +659,24 @@ def forward_models(
         loading = scenario.loading(body, coordinates_of(config))
     except UnknownError as error:
         raise ConfigError(f"registration.known_forces: {error}") from None
+    fast: Surrogate | LoadedSurrogate | None = network
+    if network is not None and loading.forces is not None:
+        fast = _loaded(network, loading.forces)
     modulus = scenario.modulus(config.material.young_modulus, body)
     material = MATERIALS[config.material.law](modulus, config.material.poisson_ratio)
     with Problem(body, material, options, held=scenario.held) as problem:
-        model = ReferenceModel(problem, patient=False, loading=loading, predictor=network, discrepancy=further)
-        yield model, network
+        model = ReferenceModel(problem, patient=False, loading=loading, predictor=fast, discrepancy=further)
+        yield model, fast
+
+
+def _loaded(network: Surrogate, known: ArrayLike) -> LoadedSurrogate:
+    """The network under known forces; a ConfigError where it has never seen any."""
+    from softtwin.surrogate.loaded import LoadedSurrogate  # torch is needed here alone
+
+    try:
+        return LoadedSurrogate(network, known)
+    except ValueError as error:
+        raise ConfigError(f"registration.known_forces: {error} Register with the reference engine.") from None
 
 
 def known_doubt(folder: Path, body: Body, config: Config) -> tuple[Discrepancy, dict[str, Any]] | None:

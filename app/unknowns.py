@@ -28,7 +28,8 @@ WORDS = (
     "metres"
 )
 _WORD = re.compile(r"(?P<kind>[a-z-]+)(?:@(?P<place>[^=]+))?(?:=(?P<number>.+))?")
-_PLACED = {"young-modulus": "maybe", "poisson-ratio": "never", "moved": "always", "contact": "never"}
+_MODULUS = "young-modulus"
+_PLACED = {_MODULUS: "maybe", "poisson-ratio": "never", "moved": "always", "contact": "never"}
 
 
 class UnknownError(ValueError):
@@ -72,11 +73,22 @@ class Unknown:
             body: the body, which has the structure or the nodes.
         """
         given = {} if self.number is None else {"deviation": self.number}
-        if self.kind == "young-modulus":
+        if self.kind == _MODULUS:
             return Stiffness(**given, cells=cells_inside(body, self.place) if self.place else None, name=self.place)
         if self.kind == "poisson-ratio":
             return PoissonRatio(**given)
         return Moved(self.place) if self.number is None else Moved(self.place, shift=self.number)
+
+
+def priors_taken(unknowns: tuple[str, ...]) -> list[str]:
+    """A line for each modulus whose prior nobody has said: beside unknown forces it is what newtons are worth.
+
+    Args:
+        unknowns: words, as `Unknown.parse` takes them.
+    """
+    silent = [text for text in unknowns if (named := Unknown.parse(text)).number is None and named.kind == _MODULUS]
+    taken = f"prior of ±{100 * Stiffness.deviation:.0f} % taken"
+    return [f"{text}: {taken}, and forces are known no better; say {text}=DEVIATION" for text in silent]
 
 
 def _positive(text: str | None, whole: str) -> float | None:
@@ -131,7 +143,7 @@ class Scenario:
 
     def modulus(self, modulus: float, body: Body) -> float | Floats:
         """Young's modulus as the material needs it: one for each cell where that of a region is unknown, pascals."""
-        by_region = any(unknown.kind == "young-modulus" and unknown.place for unknown in self.unknowns)
+        by_region = any(unknown.kind == _MODULUS and unknown.place for unknown in self.unknowns)
         return np.full(len(body.cells), modulus) if by_region else modulus
 
     @property

@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 LEAST_MODULUS = 10.0  # pascals: nothing softer is an organ
 LOWEST_RATIO, HIGHEST_RATIO = 0.2, 0.5  # open ends (Odot 2023, figure 7.27)
-_DEVIATIONS = 1.6449  # of a normal law: 90 % lie within
+WITHIN_90 = 1.6449  # deviations of a normal law that hold 90 %
 _STRIDE = {"modulus": np.log(10.0), "ratio": 1.5, "turn": 0.3}  # largest change in one step
 
 
@@ -395,6 +395,27 @@ class Conditions:
         return None
 
     @property
+    def has_regions(self) -> bool:
+        """Whether the stiffness of a part of the body is an unknown of its own."""
+        return any(isinstance(unknown, Stiffness) and unknown.cells is not None for unknown in self.unknowns)
+
+    def shares(self, direction: Floats) -> Floats:
+        """How far each unknown's own value goes along a direction of the coefficients, in its deviations beforehand.
+
+        They are the direction itself, but for a region beside the whole body: its modulus grows with both.
+
+        Args:
+            direction: (count,).
+        """
+        found, begin, modulus = direction.copy(), 0, self.modulus
+        for unknown in self.unknowns:
+            if isinstance(unknown, Stiffness) and modulus is not None and unknown.cells is not None:
+                both = np.array([unknown.deviation, modulus[1]])
+                found[begin] = both @ direction[[begin, modulus[0]]] / np.linalg.norm(both)
+            begin += unknown.count
+        return found
+
+    @property
     def has_forces_alone(self) -> bool:
         """Whether every forward model takes them."""
         return all(unknown.is_force for unknown in self.unknowns)
@@ -467,6 +488,6 @@ def estimate(name: str, unit: str, at: Callable[[float], float], mean: float, va
         mean: of the coefficient, whose variance beforehand is 1.
         variance: of it.
     """
-    reach = _DEVIATIONS * np.sqrt(max(variance, 0.0))
+    reach = WITHIN_90 * np.sqrt(max(variance, 0.0))
     told = float(np.clip(1.0 - variance, 0.0, 1.0))
     return Estimate(name, unit, at(mean), (at(mean - reach), at(mean + reach)), told, float(abs(mean)))

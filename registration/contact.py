@@ -188,4 +188,5 @@ class ContactRegistrar:
             pose=anywhere.pose,
             expectations=anywhere.expectations,
             conditions=Conditions(body, {}, (contact,)),
+            modulus_deviation=anywhere.modulus_deviation,
         )

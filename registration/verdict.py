@@ -14,6 +14,7 @@ from softtwin.meshes.metrics import displacement_gradients
 from .evidence import Scale
 from .forward import ForwardModel, State
 from .gauss_newton import Found
+from .identifiability import untold
 from .outcome import Outcome
 from .problem import Problem
 
@@ -23,6 +24,7 @@ _ASKED = 250  # points at least, whose neighbours are looked at
 _MARK_OFF = 4.0  # deviations of a landmark's place; three axes together are beyond it once in a thousand
 _LEANING = 3.0  # times what normals of the deviation that was told would be off by in the median
 _FEWEST_POINTS = 30
+_MUCH, _THIN, _ABOUT = 0.2, 0.05, 8  # share of the points that fit nowhere, thickness of a surface, neighbours for that
 # Turn (radians) or stretch that a linear law holds for, half of which it is off by, relative: a centimetre of movement
 # is then good to a camera's noise. Per cent of the cells.
 _SMALL, _NEARLY_ALL = 0.03, 95.0
@@ -68,7 +70,8 @@ class Expectations:
         pose: largest move of the pose in deviations of its prior.
         condition: the same of stiffness and other unknowns beside the forces.
         gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
-        told: least part of such an unknown's variance that a cloud must take away where all forces are known.
+        told: least part of the variance of such an unknown, and of every combination of them, that a cloud must take
+            away where all forces are known.
     """
 
     noise: float
@@ -173,6 +176,11 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
     outliers = float(np.mean(found.weights < 0.05))
     if outliers > expected.outliers:
         findings.append((Verdict.DOUBTFUL, f"{100 * outliers:.0f} % of the points fit nowhere"))
+    elif outliers > _MUCH and thickness(found.trial.cloud[found.weights < 0.05]) < _THIN:
+        findings.append(
+            (Verdict.DOUBTFUL, f"{100 * outliers:.0f} % of the points are a surface that is none of this organ's: "
+                               "something else is in the cloud")
+        )  # fmt: skip
     return findings
 
 
@@ -204,6 +212,22 @@ def shared(feet: Floats, distances: Floats, weights: Floats) -> float:
     _, near = cKDTree(points).query(points[asked], k=count + 1)
     beside = values[near[:, 1:]].mean(axis=1)
     return float(np.clip((values[asked] * beside).mean() / (values**2).mean(), 0.0, 1.0))
+
+
+def thickness(points: Floats) -> float:
+    """Part of the spread about a point that is across its neighbours' plane, median: 0 of a surface, 0.1 of a space.
+
+    Surface variation (Pauly, Gross and Kobbelt 2002).
+
+    Args:
+        points: (p, 3), metres.
+    """
+    if len(points) <= _ABOUT:
+        return 1.0
+    _, near = cKDTree(points).query(points, k=_ABOUT + 1)
+    arms = points[near] - points[near].mean(axis=1, keepdims=True)
+    squares = np.linalg.svd(arms, compute_uv=False) ** 2
+    return float(np.median(squares[:, 2] / np.maximum(squares.sum(axis=1), 1e-300)))
 
 
 def _of_the_normals(problem: Problem, found: Found) -> list[_Finding]:
@@ -274,9 +298,21 @@ def _of_the_conditions(problem: Problem, found: Found, expected: Expectations) -
             findings.append(
                 (Verdict.DOUBTFUL, f"{known.name} lies {known.deviations:.1f} deviations from where it was expected")
             )
-        if known.told < expected.told and is_asked_for:
-            findings.append(
-                (Verdict.DOUBTFUL, f"the cloud does not tell {known.name} under this load: what is given is what was "
-                                   "expected beforehand")
-            )  # fmt: skip
-    return findings
+    return findings + (_of_what_is_untold(problem, found, expected) if is_asked_for else [])
+
+
+def _of_what_is_untold(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
+    """Unknowns, and combinations of them, of which the cloud has left most of what was believed beforehand."""
+    conditions, part = problem.conditions, problem.condition_part
+    assert conditions is not None
+    covariance = found.posterior.covariance[part, part]
+    names = [known.name for known in conditions.estimates(found.trial.coefficients[part], covariance)]
+    if conditions.has_regions:
+        names = [f"{name} of the rest" if name == "Young's modulus" else name for name in names]
+    alone, combined = untold(conditions, names, covariance, expected.told)
+    given = "what is given is what was expected beforehand"
+    same = "other values that differ so would explain it as well"
+    return [
+        *((Verdict.DOUBTFUL, f"the cloud does not tell {name} under this load: {given}") for name in alone),
+        *((Verdict.DOUBTFUL, f"the cloud does not tell {names} under this load: {same}") for names in combined),
+    ]

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.stats import chi2
 
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.app.cli import softtwin
 from softtwin.app.config import ConfigError, parse_config
-from softtwin.app.unknowns import Unknown, UnknownError
-from softtwin.meshes.files import read_body
+from softtwin.app.unknowns import Unknown, UnknownError, priors_taken
+from softtwin.meshes.body import Body, Surface
+from softtwin.meshes.files import read_body, write_body
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.solve.problem import Loading, Problem
 
@@ -37,11 +40,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         load = Loading(forces, body_force=[0.0, 0.0, -1060.0 * GRAVITY])
         moved = body.points + problem.solve(load).displacement
     for number in range(3):
-        triangles = body.boundary[rng.integers(len(body.boundary), size=1500)]
-        weights = rng.dirichlet(np.ones(3), size=1500)
-        points = np.einsum("pk,pki->pi", weights, moved[triangles]) + 1e-3 * rng.standard_normal((1500, 3))
-        np.save(place / f"cloud_{number}.npy", points)
+        np.save(place / f"cloud_{number}.npy", drawn(body, moved, rng))
     return place
+
+
+def drawn(body: Body, moved: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Points over the whole surface of a moved body with a millimetre of noise, (1500, 3), metres."""
+    triangles = body.boundary[rng.integers(len(body.boundary), size=1500)]
+    weights = rng.dirichlet(np.ones(3), size=1500)
+    return np.einsum("pk,pki->pi", weights, moved[triangles]) + 1e-3 * rng.standard_normal((1500, 3))
 
 
 def run(*words: object) -> tuple[int, str]:
@@ -56,6 +63,12 @@ def identified(folder: Path, output: Path, *words: object) -> tuple[int, str, di
     return code, said, json.loads(path.read_text()) if path.exists() else {}
 
 
+def is_explained(frame: dict, net: np.ndarray) -> bool:
+    """Whether a net force, newtons, lies within what a frame says of it: 99.9 % of a normal law."""
+    missed = np.array(frame["net_force_N"]) - net
+    return bool(missed @ np.linalg.solve(frame["net_force_covariance_N2"], missed) < chi2.ppf(0.999, 3))
+
+
 def test_stiffness_and_ratio_from_several_clouds(folder: Path, tmp_path: Path) -> None:
     clouds = [folder / f"cloud_{number}.npy" for number in range(3)]
     known = ["--gravity", 0, 0, -GRAVITY, "--known-forces", folder / "forces.npy"]
@@ -63,7 +76,7 @@ def test_stiffness_and_ratio_from_several_clouds(folder: Path, tmp_path: Path) -
     code, said, record = identified(folder, tmp_path, *clouds, *known, *unknown)
     assert code == 0, said
     assert "of 3 clouds 3 could be used" in said
-    assert "net force" not in said
+    assert "net force" not in said and "taken" not in said
     modulus, ratio = record["together"]
     for estimate, truth in ((modulus, TRUE_MODULUS), (ratio, TRUE_RATIO)):
         low, high = estimate["interval"]
@@ -92,10 +105,77 @@ def test_forces_and_stiffness_together_carry_the_prior(folder: Path, tmp_path: P
     assert code == 0, said
     frame = json.loads((tmp_path / "registration.json").read_text())["frames"][0]
     assert frame["verdict"] == "accepted"
+    net = np.load(folder / "forces.npy").sum(axis=0)
+    assert is_explained(frame, net)  # and not with the weight, which is many times as much and known
+    assert 20.0 * np.linalg.norm(net) < 1060.0 * GRAVITY * 0.0625
     (modulus,) = frame["estimates"]
     assert modulus["interval"][0] < TRUE_MODULUS < modulus["interval"][1]
     assert len(frame["net_force_over_modulus_m2"]) == 3
-    assert "Young's modulus" in said
+    assert "Young's modulus" in said and "taken" not in said
+
+
+def test_forces_and_stiffness_without_a_prior_say_which_was_taken(folder: Path, tmp_path: Path) -> None:
+    words = ["--engine", "reference", "--unknown", "young-modulus", "--output", tmp_path]
+    code, said = run("register", folder / "organ.toml", folder / "cloud_0.npy", *words)
+    assert code == 0, said
+    first = said.splitlines()[0]
+    assert first == "young-modulus: prior of ±50 % taken, and forces are known no better; say young-modulus=DEVIATION"
+    (frame,) = json.loads((tmp_path / "registration.json").read_text())["frames"]
+    force, doubt = frame["net_force_N"], frame["net_force_deviation_N"]
+    assert np.linalg.norm(doubt) > 0.3 * np.linalg.norm(force)  # newtons are worth that prior
+    assert priors_taken(("young-modulus=0.5", "poisson-ratio")) == []
+    assert "young-modulus@tumour: prior of" in priors_taken(("young-modulus@tumour",))[0]
+
+
+def test_a_pull_is_found_under_pneumoperitoneum(folder: Path, tmp_path: Path) -> None:
+    """12 mmHg follow the surface and move it by 27 mm: known, they leave the pull; unsaid, they are taken for one."""
+    body, net = read_body(folder / "body.vtu"), np.array([0.0, 0.1, -0.2])
+    tip, forces = body.node_sets["tip"], np.zeros_like(body.points)
+    forces[tip] = net / len(tip)
+    with Problem(body, NeoHookean(5500.0, 0.45)) as problem:
+        moved = body.points + problem.solve(Loading(forces, pressure={"boundary": 1600.0})).displacement
+    np.save(tmp_path / "cloud.npy", drawn(body, moved, np.random.default_rng(5)))
+    frames = []
+    for words in (["--pressure", 1600.0], []):
+        given = [folder / "organ.toml", tmp_path / "cloud.npy", "--zone", "tip", "--engine", "reference", *words]
+        code, said = run("register", *given, "--output", tmp_path / "out")
+        assert code == 0, said
+        frames += json.loads((tmp_path / "out" / "registration.json").read_text())["frames"]
+    known, silent = frames
+    assert known["verdict"] == "accepted" and is_explained(known, net)
+    assert np.linalg.norm(known["net_force_deviation_N"]) < 0.3 * np.linalg.norm(net)
+    assert silent["verdict"] != "accepted" or not is_explained(silent, net)
+
+
+@pytest.mark.parametrize("command", ["identify", "register"])
+def test_a_stiff_structure_on_the_command_line(folder: Path, tmp_path: Path, command: str) -> None:
+    """A third of the beam is three times as stiff, under its weight: both moduli are found, each by its name."""
+    body, middle, half = read_body(folder / "body.vtu"), np.array([0.7, 0.125, 0.125]), np.array([0.17, 0.2, 0.2])
+    (tmp_path / "organ.toml").write_text((folder / "organ.toml").read_text())
+    write_body(tmp_path / "body.vtu", replace(body, inner={"tumour": box(middle, half)}))
+    inside = (np.abs(body.points[body.cells].mean(axis=1) - middle) < half).all(axis=1)
+    with Problem(body, NeoHookean(np.where(inside, 16500.0, 5500.0), 0.45)) as problem:
+        moved = body.points + problem.solve(Loading(body_force=[0.0, 0.0, -1060.0 * GRAVITY])).displacement
+    np.save(tmp_path / "cloud.npy", drawn(body, moved, np.random.default_rng(5)))
+    words = ["--unknown", "young-modulus=0.3", "--unknown", "young-modulus@tumour=1", "--gravity", 0, 0, -GRAVITY]
+    words += ["--engine", "reference"] if command == "register" else []
+    code, said = run(command, tmp_path / "organ.toml", tmp_path / "cloud.npy", *words, "--output", tmp_path / "out")
+    assert code == 0, said
+    (frame,) = json.loads((tmp_path / "out" / "registration.json").read_text())["frames"]
+    rest, tumour = frame["estimates"]
+    assert tumour["name"] == "Young's modulus of tumour" and "Young's modulus of tumour" in said
+    assert rest["interval"][0] < 5500.0 < rest["interval"][1]
+    assert tumour["interval"][0] < 16500.0 < tumour["interval"][1]
+    if command == "identify":  # where the load is known, it is told from the rest's
+        assert tumour["interval"][0] > rest["interval"][1] and tumour["told"] > 0.5
+
+
+def box(middle: np.ndarray, half: np.ndarray) -> Surface:
+    """A closed surface of twelve triangles, outward."""
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = [each for a, b, c, d in sides for each in ((a, b, c), (a, c, d))]
+    return Surface(middle + half * signs, np.array(triangles))
 
 
 def test_one_contact(folder: Path, tmp_path: Path) -> None:
@@ -133,7 +213,13 @@ def test_a_network_takes_no_other_stiffness() -> None:
         parse_config({"registration": {"unknowns": ["young-modulus"]}})
     with pytest.raises(ConfigError, match=r"registration\.model: expected reference with these unknowns"):
         parse_config({"registration": {"model": "hybrid", "gravity": [0.0, 0.0, -9.81]}})
+    with pytest.raises(ConfigError, match=r"registration\.model: expected reference or hybrid with these unknowns"):
+        parse_config({"registration": {"known_forces": "forces.npy"}})
+    with pytest.raises(ConfigError, match=r"registration\.model: expected reference with these unknowns"):
+        known = {"unknowns": ["young-modulus"], "forces": "known"}  # nothing is left for a network to find
+        parse_config({"registration": {"model": "hybrid", **known}})
     parse_config({"registration": {"unknowns": ["contact"]}})
+    parse_config({"registration": {"model": "hybrid", "known_forces": "forces.npy"}})
 
 
 @pytest.mark.parametrize("text", ["young-modulus@", "=3", "moved@a=b", "contact=nan"])

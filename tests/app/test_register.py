@@ -24,7 +24,7 @@ from softtwin.app.twin import Twin
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import FileError, read_body
+from softtwin.meshes.files import FileError, read_body, write_body
 from softtwin.registration.pose import Pose
 from softtwin.registration.unknowns import PosePrior
 
@@ -181,11 +181,31 @@ def test_every_frame_is_written_with_its_verdict(plain_twin: Twin, cloud, forces
     assert np.allclose(first["pose"], np.eye(4))
     deviations = np.sqrt(np.diag(first["net_force_covariance_N2"]))
     np.testing.assert_allclose(deviations, first["net_force_deviation_N"], rtol=1e-12)
+    middle, reach = np.mean(first["net_force_90_N"], axis=1), 0.5 * np.diff(first["net_force_90_N"], axis=1)[:, 0]
+    np.testing.assert_allclose(middle, first["net_force_N"], atol=1e-12)
+    np.testing.assert_allclose(reach, 1.6449 * deviations, rtol=1e-9)
+    assert f", {first['informed']:.0f} directions seen" in lines[0] and first["informed"] > 1.5
     assert second["verdict"] == "refused" and "empty" in second["reasons"][0] and second["files"] == []
     assert third["evaluations"] < first["evaluations"]
     assert lines[0].startswith("frame   0: accepted, cloud to surface 0.")
     assert lines[1] == "frame   1: refused (cloud: expected at least one point, got an empty cloud.)"
     assert len(rows) == 3
+
+
+def test_forces_over_stiffness_are_no_less_known_where_the_stiffness_is_not(plain_twin: Twin, cloud, tmp_path) -> None:
+    """The prior of the modulus is what newtons are worth: it is in their interval, and not in what the cloud tells."""
+    rows = []
+    for deviation in (0.0, 0.3):
+        material = {"young_modulus": 4000.0, "young_modulus_deviation": deviation}
+        config = Config.model_validate({"material": material, "registration": {"zone": "tip"}})
+        twin = Twin(plain_twin.model, config)
+        rows.append(register_clouds(twin, [cloud], tmp_path / f"{deviation}", say=lambda line: None)[0])
+    sharp, wide = rows
+    np.testing.assert_allclose(wide["net_force_over_modulus_m2"], np.array(wide["net_force_N"]) / 4000.0, rtol=1e-12)
+    for name in ("net_force_over_modulus_m2", "net_force_over_modulus_deviation_m2"):
+        np.testing.assert_allclose(wide[name], sharp[name], rtol=1e-6)
+    assert np.ptp(wide["net_force_90_N"][2]) > 2.0 * 1.6449 * 0.3 * abs(wide["net_force_N"][2])
+    assert np.ptp(sharp["net_force_90_N"][2]) < 0.5 * np.ptp(wide["net_force_90_N"][2])
 
 
 def test_clouds_that_hold_nothing_usable_are_refused_frames(plain_twin: Twin, cloud, tmp_path: Path) -> None:
@@ -265,6 +285,8 @@ def test_figures_are_on_the_axes_of_the_twins_files(plain_twin: Twin, cloud, for
     turned = register_clouds(twin, [seen], tmp_path / "ras", camera=known, say=lambda line: None)[0]
     flip = np.array([-1.0, -1.0, 1.0])
     np.testing.assert_allclose(turned["net_force_N"], flip * plain["net_force_N"], rtol=1e-12)
+    middle = np.mean(turned["net_force_90_N"], axis=1)
+    np.testing.assert_allclose(middle, turned["net_force_N"], rtol=1e-9)
     covariance = flip[:, None] * np.array(plain["net_force_covariance_N2"]) * flip
     np.testing.assert_allclose(turned["net_force_covariance_N2"], covariance, rtol=1e-12)
     point = np.array([0.1, 0.2, 0.3])
@@ -325,6 +347,22 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
     assert {path.suffix for path in (mesh_folder / "found").iterdir()} == {".json", ".ply", ".stl"}
 
 
+def test_a_budget_bounds_each_frame_of_a_sequence(capsys, mesh_folder: Path, mesh_cloud: Path) -> None:
+    """No time at all: where each search begins, and said so; time enough: as without a budget."""
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    frames = []
+    for budget in ("1e-9", "600"):
+        said = register(capsys, mesh_folder, mesh_cloud, mesh_cloud, "--budget", budget)
+        frames.append(record_of(mesh_folder / "found")["frames"])
+        assert ("the time for it was over" in said) == (budget == "1e-9")
+    short, long = frames
+    assert [frame["verdict"] for frame in short] == ["doubtful"] * 2
+    assert [frame["outcome"] for frame in short + long] == ["out_of_time"] * 2 + ["converged"] * 2
+    assert short[0]["evaluations"] < long[0]["evaluations"] and short[0]["rms_distance_m"] > long[0]["rms_distance_m"]
+    said = register(capsys, mesh_folder, mesh_cloud, "--budget", 0, code=2)
+    assert "--budget: expected a positive time in seconds, got 0.0" in said
+
+
 def test_strict_ends_with_code_3(capsys, mesh_folder: Path, mesh_cloud: Path) -> None:
     pytest.importorskip("petsc4py", reason="FEniCSx is absent")
     np.save(mesh_folder / "empty.npy", np.empty((0, 3)))
@@ -339,6 +377,9 @@ def test_strict_ends_with_code_3(capsys, mesh_folder: Path, mesh_cloud: Path) ->
         (("--zone", "nowhere"), "registration.zone: expected one of"),
         (("--format", "xyz"), "--format: expected vtu, stl, ply, vtp, got xyz"),
         (("--noise", "-1"), "registration.noise"),
+        (("--pose", "unknown", "--pose-turn", "0"), "registration.pose_turn: Input should be greater than 0"),
+        (("--pose", "unknown", "--pose-shift", "0"), "registration.pose_shift: Input should be greater than 0"),
+        (("--zone", "tip", "--unknown", "moved@tip"), "got tip, all of which moved@ holds"),
         (("--truth", "cloud.npy"), "--truth: expected shape"),
         (("--align", "auto", "--start", "cloud.npy"), "expected one of them"),
         (("--start", "cloud.npy"), "cloud.npy"),
@@ -361,6 +402,38 @@ def test_a_cloud_that_cannot_be_is_refused_with_its_file(capsys, mesh_folder: Pa
     np.save(mesh_folder / "bad.npy", points)
     said = register(capsys, mesh_folder, mesh_folder / "bad.npy", code=2)
     assert "bad.npy" in said and message in said and "Traceback" not in said
+
+
+PLY = "ply\nformat {} 1.0\nelement vertex 50\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+
+
+@pytest.mark.parametrize("kind", ["npy", "ascii", "binary_little_endian"])
+@pytest.mark.parametrize("part", [0.05, 0.5, 0.95])
+def test_a_cloud_that_is_cut_is_said_to_be_truncated(capsys, mesh_folder: Path, kind: str, part: float) -> None:
+    points = np.random.default_rng(0).random((50, 3)).astype("<f4")
+    path = mesh_folder / ("cut.npy" if kind == "npy" else "cut.ply")
+    if kind == "npy":
+        np.save(path, points)
+    else:
+        rows = points.tobytes() if kind != "ascii" else "".join(f"{x} {y} {z}\n" for x, y, z in points).encode()
+        path.write_bytes(PLY.format(kind).encode() + rows)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(part * len(whole))])
+    said = register(capsys, mesh_folder, path, code=2)
+    assert path.name in said and "truncated" in said and "Traceback" not in said
+
+
+def test_a_support_without_a_free_node_is_said(capsys, mesh_folder: Path, mesh_cloud: Path, seen_body: Body) -> None:
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    write_body(mesh_folder / "body.vtu", seen_body.with_sets(fixed=seen_body.boundary_nodes))
+    said = register(capsys, mesh_folder, mesh_cloud, code=2)
+    assert "Body.fixed: expected free nodes on the boundary, got all" in said and "nothing is left" in said
+
+
+def test_a_camera_inside_the_organ_is_asked_about(capsys, mesh_folder: Path, tmp_path: Path) -> None:
+    words = ("--fixed", "halfspace:0.001,0,0:-1,0,0", "--observed", "seen-from:0.15,0.03,0.03")
+    said = run(capsys, "build", mesh_folder / "body.vtu", *words, "--output", tmp_path / "made", code=2)
+    assert "seen from (150, 30, 30) mm" in said and "is the camera inside?" in said
 
 
 def test_a_cloud_one_metre_away_is_refused_with_the_distance(capsys, mesh_folder: Path, mesh_cloud: Path) -> None:

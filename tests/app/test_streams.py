@@ -199,6 +199,27 @@ def test_a_stream_is_recorded_with_garbage_in_it(plain_twin: Twin, cloud: np.nda
     assert keeping_up(rows).startswith("4 frames, ") and keeping_up([]) == "no cloud has come"
 
 
+def test_frames_of_another_organ_in_between_are_refused_and_the_stream_goes_on(
+    plain_twin: Twin, cloud: np.ndarray, tmp_path: Path
+) -> None:
+    """The frame after them is as if they had not been: it starts from the last one that could be used."""
+    chance, taken = np.random.default_rng(2), threading.Semaphore(0)
+    ball = chance.standard_normal((400, 3))
+    other = 0.06 * ball / np.linalg.norm(ball, axis=1)[:, None] + plain_twin.body.points.mean(axis=0)
+
+    def camera():
+        for each in (cloud, other, other, other, cloud):
+            yield each
+            taken.acquire(timeout=60.0)
+
+    rows = register_live(plain_twin, fed(camera()), tmp_path, zone="tip", formats=(), say=lambda line: taken.release())
+    assert [row["verdict"] for row in rows] == ["accepted", "refused", "refused", "refused", "accepted"]
+    assert all("do not match" in row["reasons"][0] for row in rows[1:4])
+    apart = np.array(rows[4]["net_force_N"]) - rows[0]["net_force_N"]
+    assert (np.abs(apart) < 0.2 * np.array(rows[0]["net_force_deviation_N"])).all()
+    assert rows[4]["evaluations"] < rows[0]["evaluations"]
+
+
 def test_a_stream_of_nothing_usable_says_so(plain_twin: Twin, tmp_path: Path) -> None:
     with pytest.raises(CloudError, match="no cloud could be registered"):
         register_live(plain_twin, fed([np.full((50, 3), np.nan)]), tmp_path, zone="tip", formats=())

@@ -17,6 +17,7 @@ from softtwin.registration.conditions import Conditions, Moved, PoissonRatio, St
 from softtwin.registration.contact import Contact, ContactRegistrar, Patch
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import expected_force, prepare
+from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -242,6 +243,39 @@ def test_under_dead_forces_a_cloud_tells_forces_over_stiffness_alone(
 
 
 @pytest.mark.fenicsx
+def test_stiffness_ratio_forces_and_pose_are_found_together(body: Body, solved, rng: np.random.Generator) -> None:
+    """The cloud tells pose, places and forces over stiffness; newtons are worth the prior of the modulus."""
+    net, centre = np.array([0.0, 0.3, -1.0]), body.points.mean(axis=0)
+    true = Pose.identity().moved(np.array([0.01, 0.03, -0.02, 2e-3, -3e-3, 1e-3]), centre)
+    truth = solved.solve(tip_forces(body, tuple(net))).displacement
+    model = reference(body, NeoHookean(5500.0, 0.45))
+    conditions = Conditions(body, model.problem.material.parameters, (Stiffness(0.3), PoissonRatio()))
+    registrar = prepare(
+        model,
+        body.node_sets["tip"],
+        body.surfaces["observed"],
+        force_scale=expected_force(body, 5500.0),
+        smoothness=0.1,
+        pose=PosePrior(Pose.identity(), centre, np.deg2rad(5.0), 0.01),
+        conditions=conditions,
+    )
+    found = registrar.register(true.apply(cloud_on(body, truth, 800, rng, 5e-4)))
+    assert found.judgement.verdict is Verdict.ACCEPTED, found.judgement.reasons
+    modulus, ratio = found.estimates
+    assert modulus.interval[0] < 6500.0 < modulus.interval[1] and modulus.told < 0.5
+    assert ratio.interval[0] < 0.42 < ratio.interval[1]
+    over, doubt = found.force_over_modulus
+    assert (np.abs(over - net / 6500.0) < 4.0 * doubt).all()
+    of_newtons = found.net_force_deviation[2] / abs(found.net_force[2])
+    assert doubt[2] / abs(over[2]) < 0.6 * of_newtons and of_newtons > 0.25
+    missed = found.net_force - net
+    assert missed @ np.linalg.solve(found.net_force_covariance, missed) < chi2.ppf(0.999, 3)
+    in_camera = found.pose.apply(body.points + found.displacement) - true.apply(body.points + truth)
+    assert np.linalg.norm(in_camera, axis=1).mean() < 2e-3 < np.linalg.norm(truth, axis=1).mean() / 10.0
+    model.problem.close()
+
+
+@pytest.mark.fenicsx
 def test_what_a_cloud_does_not_tell_is_called_so(body: Body, solved, rng: np.random.Generator) -> None:
     registrar = under_known_load(body, np.zeros_like(body.points), WRONG, (Stiffness(), PoissonRatio()))
     found = registrar.register(cloud_on(body, np.zeros_like(body.points), 600, rng, 1e-3))
@@ -400,6 +434,33 @@ def test_stiffness_that_is_not_known_goes_into_the_newtons(body: Body, solved, r
     np.testing.assert_allclose(wide.uncertainty.deviation, sharp.uncertainty.deviation)
     with pytest.raises(ValueError, match=r"Registrar\.modulus_deviation: expected 0 or more, got -1"):
         prepare(Cantilever(body), body.node_sets["tip"], force_scale=1.0, modulus_deviation=-1.0)
+
+
+@pytest.mark.fenicsx
+def test_stiffness_that_is_not_known_goes_into_the_newtons_of_one_contact(
+    body: Body, solved, rng: np.random.Generator
+) -> None:
+    """Along the force that was found, as with forces anywhere: it had been left out, and 0.004 N stayed of 0.24."""
+    from softtwin.reference.derivatives.model import ReferenceModel
+
+    nodes = np.setdiff1d(body.boundary_nodes, body.fixed)
+    contact = Conditions(body, {}, (Contact(nodes, np.array([0.6, 0.15, 0.2]), 0.1, 0.08, 1.0),))
+    truth = solved.solve(contact.forces(np.array([0.0, 0.0, 0.0, 0.2, 0.1, -1.0]))).displacement
+    cloud = cloud_on(body, truth, 800, rng, 1e-3)
+    found = []
+    for deviation in (0.0, 0.3):
+        anywhere = prepare(
+            ReferenceModel(solved, patient=False),
+            nodes,
+            body.surfaces["observed"],
+            force_scale=expected_force(body, 6500.0),
+            modulus_deviation=deviation,
+        )
+        found.append(ContactRegistrar(anywhere, Patch(0.08)).register(cloud))
+    sharp, wide = found
+    added = wide.net_force_covariance - sharp.net_force_covariance
+    np.testing.assert_allclose(added, 0.09 * np.outer(wide.net_force, wide.net_force), atol=1e-9)
+    assert wide.net_force_deviation[2] > 0.3 * abs(wide.net_force[2]) > 10.0 * sharp.net_force_deviation[2]
 
 
 @pytest.mark.fenicsx

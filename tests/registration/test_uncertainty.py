@@ -22,10 +22,10 @@ from .conftest import Cantilever, cloud_on
 NOISE, FORCE = 2e-3, 0.03
 
 
-def registrar(body: Body, pose: PosePrior | None = None) -> Registrar:
+def registrar(body: Body, pose: PosePrior | None = None, most_points: int = 1000) -> Registrar:
     observed = SurfaceDistance(body, body.surfaces["observed"])
     forces = nodal_forces(body, body.node_sets["tip"], Scale(FORCE, 0.0))
-    options = RegistrationOptions(noise=Scale(NOISE, 0.0), gathering=Gathering(rounds=0))
+    options = RegistrationOptions(noise=Scale(NOISE, 0.0), gathering=Gathering(rounds=0), most_points=most_points)
     return Registrar(Cantilever(body), observed, forces, options, pose=pose)
 
 
@@ -85,7 +85,7 @@ def test_more_points_and_less_noise_make_it_surer(body: Body) -> None:
 
 
 def test_a_dense_cloud_tells_no_more_than_a_thinned_one(body: Body) -> None:
-    """50,000 points of a camera share their noise: they count as the thousand that are used."""
+    """50,000 points, each with its own noise: they count as the thousand that are used."""
     made = registrar(body)
     truth = made.model.solve(made.forces.forces(np.full(made.forces.size, 0.5 * FORCE))).displacement
     told = []
@@ -94,6 +94,42 @@ def test_a_dense_cloud_tells_no_more_than_a_thinned_one(body: Body) -> None:
         assert result.points == 1_000 and result.rms_distance == pytest.approx(NOISE, rel=0.07)
         told.append(np.trace(np.linalg.inv(result.posterior.covariance)))
     assert told[1] == pytest.approx(told[0], rel=0.2)
+
+
+def test_a_dense_cloud_promises_no_more_than_its_patches_allow(body: Body) -> None:
+    """50,000 points, all used, whose noise is a smooth field: as many tell what one would as share a patch.
+
+    Noise of correlation exp(-d^2 / 2 s^2) is independent from one patch of 2 pi s^2 to the next: of the 0.32 m^2 seen
+    there are some 57. So many points with noise of their own are the floor. Half of it (a quarter of the information)
+    is let pass: forces have explained a part of what points share before that is looked at.
+    """
+    length, count = 0.03, 50_000
+    patches = round(2 * 0.8 * 0.2 / (2.0 * np.pi * length**2))
+    dense, sparse = registrar(body, most_points=count), registrar(body)
+    truth = sparse.model.solve(sparse.forces.forces(np.full(sparse.forces.size, 0.5 * FORCE))).displacement
+    doubt: dict[str, list[float]] = {"floor": [], "alike": [], "dense": [], "believed": []}
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        few = sparse.register(cloud_on(body, truth, patches, rng, NOISE))
+        doubt["floor"].append(float(few.uncertainty.deviation.mean()))
+        cloud = cloud_on(body, truth, count, rng)
+        found = dense.register(cloud + NOISE * smooth_field(cloud, length, rng))
+        assert found.points == count
+        doubt["alike"].append(found.alike)
+        doubt["dense"].append(float(found.uncertainty.deviation.mean()))
+        believed = dense.register(cloud + NOISE * rng.standard_normal(cloud.shape))
+        doubt["believed"].append(float(believed.uncertainty.deviation.mean()))
+    assert np.median(doubt["alike"]) > 0.25 * count / patches
+    assert np.median(doubt["dense"]) > 0.5 * np.median(doubt["floor"])
+    assert np.median(doubt["believed"]) < 0.2 * np.median(doubt["floor"])  # noise of their own is told from it
+
+
+def smooth_field(points: np.ndarray, length: float, rng: np.random.Generator) -> np.ndarray:
+    """Random Fourier features of a Gaussian correlation, (p, 3), of unit variance, a part of the points at a time."""
+    waves, begun = rng.standard_normal((3, 400)) / length, 2.0 * np.pi * rng.random(400)
+    weights = np.sqrt(2.0 / 400) * rng.standard_normal((400, 3))
+    parts = np.array_split(points, max(1, len(points) // 2000))
+    return np.concatenate([np.cos(part @ waves + begun) @ weights for part in parts])
 
 
 def test_an_unknown_pose_adds_to_it(body: Body, rng: np.random.Generator) -> None:

@@ -10,7 +10,7 @@ from softtwin.registration.evidence import Scale
 from softtwin.registration.registrar import Registrar, expected_force, prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import nodal_forces
-from softtwin.registration.verdict import Verdict, shared
+from softtwin.registration.verdict import Verdict, shared, thickness
 
 from .conftest import Cantilever, cloud_on, tip_forces
 
@@ -45,9 +45,45 @@ def test_random_points_match_no_organ(registrar: Registrar, rng) -> None:
 
 def test_another_organ_does_not_match(registrar: Registrar, rng) -> None:
     """A ball in the middle of the beam: smooth, dense, without noise, and wrong in whole patches."""
-    ball = rng.standard_normal((600, 3))
-    ball = 0.15 * ball / np.linalg.norm(ball, axis=1)[:, None] + np.array([0.4, 0.1, 0.1])
-    refused(registrar, ball, "do not match")
+    refused(registrar, ball(600, 0.15, np.array([0.4, 0.1, 0.1]), rng), "do not match")
+
+
+def ball(count: int, radius: float, middle: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    points = rng.standard_normal((count, 3))
+    return radius * points / np.linalg.norm(points, axis=1)[:, None] + middle
+
+
+@pytest.mark.parametrize("share", [0.3, 0.45, 0.6])
+@pytest.mark.parametrize("gap", [0.0, 0.03], ids=["touching", "beside"])
+@pytest.mark.parametrize("radius", [0.05, 0.15])
+def test_two_organs_in_one_cloud_are_no_organ(
+    body: Body, registrar: Registrar, rng, share: float, gap: float, radius: float
+) -> None:
+    """The other's points fit nowhere together, as one surface: no camera's outliers do that."""
+    truth = registrar.model.solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
+    own = cloud_on(body, truth, round(600 * (1.0 - share)), rng, 5e-4)
+    beside = np.array([0.4, 0.2 + radius + gap, 0.1])
+    judged = registrar.register(np.vstack([own, ball(round(600 * share), radius, beside, rng)])).judgement
+    assert judged.verdict is not Verdict.ACCEPTED
+    if share == 0.3 and radius == 0.05 and gap == 0.0:  # as many outliers are let pass
+        assert any("a surface that is none of this organ's" in reason for reason in judged.reasons), judged.reasons
+
+
+@pytest.mark.parametrize("share", [0.1, 0.28])
+def test_outliers_of_a_camera_are_no_other_organ(body: Body, registrar: Registrar, rng, share: float) -> None:
+    truth = registrar.model.solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
+    cloud = cloud_on(body, truth, 600, rng, 5e-4)
+    wild = rng.random(600) < share
+    cloud += wild[:, None] * rng.uniform(-0.05, 0.05, cloud.shape)
+    judged = registrar.register(cloud).judgement
+    assert judged.verdict is Verdict.ACCEPTED, judged.reasons
+
+
+def test_the_thickness_of_a_surface_and_of_a_space(rng) -> None:
+    """Of a ball it is what its curvature makes of eight neighbours' reach; of points in space a tenth and more."""
+    assert thickness(ball(300, 0.1, np.zeros(3), rng) + 5e-4 * rng.standard_normal((300, 3))) < 0.02
+    assert thickness(rng.random((300, 3))) > 0.08
+    assert thickness(np.zeros((8, 3))) == 1.0  # too few to tell
 
 
 def test_a_load_beyond_what_was_learned_is_doubtful(body: Body, registrar: Registrar, rng) -> None:

@@ -1,0 +1,67 @@
+"""Under a budget the answer is the best so far: more time never makes it worse, and it says that time was over."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from softtwin.meshes.body import Body
+from softtwin.registration.evidence import Scale
+from softtwin.registration.lbfgs import LBFGS
+from softtwin.registration.outcome import Outcome
+from softtwin.registration.registrar import Gathering, Registrar, RegistrationOptions
+from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.unknowns import nodal_forces
+from softtwin.registration.verdict import Verdict
+
+from .conftest import Cantilever, CantileverState, cloud_on, tip_forces
+
+
+class Ticking(Cantilever):
+    """A model of which each state takes a second of a clock that nothing else moves."""
+
+    now = 0.0
+
+    def solve(self, forces: ArrayLike, near: Any = None) -> CantileverState:
+        self.now += 1.0
+        return super().solve(forces, near)
+
+
+@pytest.fixture
+def model(body: Body, monkeypatch: pytest.MonkeyPatch) -> Ticking:
+    made = Ticking(body)
+    monkeypatch.setattr(time, "monotonic", lambda: made.now)
+    return made
+
+
+@pytest.mark.parametrize("solver", ["gauss-newton", "l-bfgs"])
+def test_more_time_gives_no_worse_an_answer(body: Body, model: Ticking, rng, solver: str) -> None:
+    """By the seconds of a model that counts them; what two answers in noise may differ by is their own doubt."""
+    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
+    cloud = cloud_on(body, truth, 400, rng, 5e-4)
+    options = RegistrationOptions(gathering=Gathering(rounds=0))
+    if solver == "l-bfgs":
+        options = RegistrationOptions(gathering=Gathering(rounds=0), solver=LBFGS())
+    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 2.0, least=1e-4))
+    registrar = Registrar(model, SurfaceDistance(body, body.surfaces["observed"]), forces, options)
+    model.now = 0.0
+    whole = registrar.register(cloud)
+    needed, doubt = model.now, float(whole.uncertainty.deviation.mean())
+    assert whole.outcome is Outcome.CONVERGED and needed > 6.0
+    errors, solved = [], []
+    for budget in (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, needed, 2.0 * needed):
+        model.now = 0.0
+        found = registrar.limited(budget).register(cloud)
+        errors.append(float(np.linalg.norm(found.displacement - truth, axis=1).mean()))
+        solved.append(found.evaluations)
+        is_over = found.outcome is Outcome.OUT_OF_TIME
+        assert is_over == (found.judgement.verdict is not Verdict.ACCEPTED), found.judgement.reasons
+        assert not is_over or "the time for it was over" in found.judgement.reasons[0]
+    assert (np.diff(errors) <= 0.5 * doubt).all(), errors
+    assert errors[0] > 10.0 * errors[-1] and errors[-1] < 2.0 * doubt
+    assert (np.diff(solved) >= 0).all() and solved[0] < 0.5 * solved[-1]
+    assert found.outcome is Outcome.CONVERGED
