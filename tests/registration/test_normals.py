@@ -27,11 +27,11 @@ from .test_model_error import patterns
 
 Floats = NDArray[np.float64]
 NET = (0.0, 0.3, -0.8)  # across the beam: how it leans says nothing of a pull along it
-NOISE, LEANING = 5e-4, np.deg2rad(1.0)
+NOISE, LEANING = 5e-4, np.deg2rad(0.25)
 
 
 def oriented(body: Body, u: Floats, count: int, seed: int, noise: float = NOISE) -> Floats:
-    """A noisy cloud of the observed side with normals that are off by a degree, half of them inward, (p, 6)."""
+    """A noisy cloud of the observed side with normals that are off by a quarter of a degree, half inward, (p, 6)."""
     rng = np.random.default_rng(seed)
     cloud = cloud_on(body, u, count, rng, 0.0)
     observed = SurfaceDistance(body, body.surfaces["observed"])
@@ -107,16 +107,17 @@ def registrar(body: Body, **options: object) -> Registrar:
 
 
 def test_normals_tell_what_noisy_points_do_not(body: Body) -> None:
+    """Of a bend over 0.8 m a normal good to 0.25 degrees tells what a point good to some 3 mm does; these have 8 mm."""
     u = Cantilever(body).solve(tip_forces(body, NET)).displacement
     own, errors, covered = registrar(body), [], []
     for seed in range(16):
-        seen = oriented(body, u, 200, seed, noise=5e-3)
+        seen = oriented(body, u, 400, seed, noise=8e-3)
         for cloud in (seen[:, :3], seen):
             found = own.register(cloud)
             missed = found.displacement - u
             errors.append(np.linalg.norm(missed[:, 1:], axis=1).mean())
             covered.append((np.linalg.norm(missed, axis=1) <= found.uncertainty.margin() + 1e-12).mean())
-    assert np.mean(errors[1::2]) < 0.85 * np.mean(errors[::2])
+    assert np.mean(errors[1::2]) < 0.6 * np.mean(errors[::2])
     assert np.mean(covered[1::2]) > 0.75
 
 
