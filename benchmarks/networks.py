@@ -255,7 +255,7 @@ def run(row: Row, data: dict[str, DataSet], problem: Problem | None, learned: Da
 def draws_of(row: Row, data: DataSet) -> int:
     """How many draws a row learns from, those that were rejected with them."""
     few = row.samples if row.plan is None else row.plan.samples
-    every = int(data.header["plan"]["samples"]["train"])
+    every = int(data.header["samples"]["train"])
     return every if few is None else min(few, every)
 
 
