@@ -4,8 +4,10 @@
 
 Networks of the beam of 304 hexahedra at the sizes of `networks.py`, with fresh weights: their cost does not depend on
 what they have learned. Times are medians. Of a batch the weights are read once, and every sample needs its operations:
-both are given as shares of what a large product reaches on the same machine. Without --data a small data set is made
-(a minute). Each network is written as it is finished; the same command goes on, and --again begins anew.
+both are given as shares of what a large product or convolution reaches on the same machine. `off` says how far fast
+predictions lie from the surrogate's own, `push_ms` what 64 tangents take by the network's own derivatives and by
+torch.func. Without --data a small data set is made (a minute). Each network is written as it is finished; the same
+command goes on, and --again begins anew.
 """
 
 from __future__ import annotations
@@ -20,11 +22,12 @@ from typing import Any
 import numpy as np
 import torch
 from networks import CHANNELS, data_of
+from numpy.typing import NDArray
 from record import recorded, write
 from threadpoolctl import threadpool_limits
 
 from softtwin.reference.data.dataset import DataSet
-from softtwin.surrogate.architecture import Architecture
+from softtwin.surrogate.architecture import Architecture, Differentiated
 from softtwin.surrogate.export import export
 from softtwin.surrogate.exported import ExportedTwin
 from softtwin.surrogate.fast import FastSurrogate
@@ -36,6 +39,7 @@ from softtwin.surrogate.umesh import UMesh
 
 BATCHES = (1, 16, 256)
 LEAST_SECONDS = 1.0
+CACHED = 2**23  # bytes: so much of weights stays in a core's cache
 
 
 def surrogate_of(architecture: Architecture, data: DataSet) -> Surrogate:
@@ -59,10 +63,13 @@ def median_ms(task: Callable[[], Any]) -> float:
 
 
 def peak(device: str) -> dict[str, float]:
-    """What large products reach in single precision: operations and bytes a second."""
-    matrix = torch.ones(2048, 2048, device=device)
-    vector = torch.ones(2048, 1, device=device)
-    wide = torch.ones(16384, 2048, device=device)
+    """What large products and convolutions reach in single precision: operations and bytes a second.
+
+    Bytes are those of a matrix that is far larger than any cache, and of one that stays in it.
+    """
+    matrix, vector = torch.ones(2048, 2048, device=device), torch.ones(2048, 1, device=device)
+    wide, few = torch.ones(16384, 2048, device=device), torch.ones(int(CACHED / 8192), 2048, device=device)
+    image, kernel = torch.ones(1, 64, 24, 24, 24, device=device), torch.ones(64, 64, 3, 3, 3, device=device)
 
     def timed(task: Callable[[], Any]) -> float:
         def whole() -> None:
@@ -72,9 +79,12 @@ def peak(device: str) -> dict[str, float]:
 
         return 1e-3 * median_ms(whole)
 
+    product = 2 * 2048**3 / timed(lambda: matrix @ matrix)
+    convolution = 2 * kernel.numel() * 24**3 / timed(lambda: torch.nn.functional.conv3d(image, kernel, padding=1))
     return {
-        "operations_per_s": 2 * 2048**3 / timed(lambda: matrix @ matrix),
+        "operations_per_s": max(product, convolution),
         "bytes_per_s": 4 * wide.numel() / timed(lambda: wide @ vector),
+        "cached_bytes_per_s": 4 * few.numel() / timed(lambda: few @ vector),
     }
 
 
@@ -90,6 +100,20 @@ def counted(surrogate: Surrogate) -> tuple[float, float]:
         module(torch.zeros(1, inputs))
     arrays = [*module.parameters(), *(b for b in module.buffers() if b.is_floating_point())]
     return float(counter.get_total_flops()), float(sum(4 * a.numel() for a in arrays))
+
+
+def apart(surrogate: Surrogate, load: NDArray[np.float64], displacement: NDArray[np.float64]) -> float:
+    """How far a displacement lies from the surrogate's own, largest component over the largest."""
+    own = surrogate.solve(load).displacement
+    return float(np.abs(displacement - own).max() / np.abs(own).max())
+
+
+def pushed(surrogate: Surrogate, count: int = 64) -> dict[str, float]:
+    """Tangents of the network alone in single precision: by its own derivatives, and by torch.func."""
+    network, width = surrogate.single, len(surrogate.maps.encoded(np.zeros(3 * len(surrogate.maps.loaded))))
+    at, tangents = torch.ones(width), torch.ones(width, count)
+    ways = {"own": network.linearised(at), "torch.func": Differentiated(network, at)}
+    return {name: median_ms(lambda way=way: way.push(tangents)) for name, way in ways.items()}
 
 
 def measured(
@@ -118,11 +142,14 @@ def measured(
         found["batches"][batch] = {
             "samples_per_s": batch / seconds,
             "share_of_operations": batch * operations / seconds / limits["operations_per_s"],
-            "share_of_bytes": size / seconds / limits["bytes_per_s"],
+            "share_of_bytes": size / seconds / limits["cached_bytes_per_s" if size <= CACHED else "bytes_per_s"],
         }
+    found["off"] = {"fast": apart(surrogate, loads[0], fast.solve(loads[0]))}
+    found["push_ms"] = pushed(surrogate)
     if graphs:
         with tempfile.TemporaryDirectory() as temporary:
             runtime = ExportedTwin(export(surrogate, Path(temporary) / "graphs"))
+        found["off"]["onnxruntime"] = apart(surrogate, loads[0], runtime.solve(loads[0]))
         found["onnxruntime_ms"] = median_ms(lambda: runtime.solve(loads[0]))
         found["onnxruntime_with_jacobian_ms"] = median_ms(lambda: runtime.linearised(coefficients))
     return found

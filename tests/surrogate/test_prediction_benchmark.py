@@ -22,7 +22,8 @@ def quick(tmp_path: Path, data: DataSet, monkeypatch: pytest.MonkeyPatch) -> Ite
     monkeypatch.setattr("record.RESULTS", tmp_path / "records")
     for name, value in {"LEAST_SECONDS": 0.0, "BATCHES": (1, 2), "CHANNELS": 2}.items():
         monkeypatch.setattr(prediction, name, value)
-    monkeypatch.setattr(prediction, "peak", lambda device: {"operations_per_s": 1e12, "bytes_per_s": 1e12})
+    limits = {"operations_per_s": 1e12, "bytes_per_s": 1e12, "cached_bytes_per_s": 1e12}
+    monkeypatch.setattr(prediction, "peak", lambda device: limits)
     monkeypatch.setattr(sys, "argv", ["prediction.py", "--data", str(data.path), "--device", "cpu"])
     threads = torch.get_num_threads()
     yield
@@ -38,6 +39,7 @@ def test_every_network_is_timed_once(quick: None, monkeypatch: pytest.MonkeyPatc
         assert figures["device"] == "cpu" and figures["weights_bytes"] > 0.0 and figures["operations"] > 0.0
         assert min(figures[name] for name in ("double_ms", "single_ms", "with_jacobian_ms")) > 0.0
         assert set(figures["batches"]) == {"1", "2"}
+        assert figures["off"]["fast"] < 1e-6 and set(figures["push_ms"]) == {"own", "torch.func"}
     monkeypatch.setattr(prediction, "measured", None)
     prediction.main()
     assert recorded("prediction") == found
