@@ -1,6 +1,6 @@
 """Registration of the real liver with a surrogate: the same frames, truth and metrics as with the reference.
 
-    python benchmarks/registration_surrogate.py [--ranks 2] [--seconds 300] [--frames 50]
+    python benchmarks/registration_surrogate.py [--ranks 2] [--seconds 300] [--draws 1360] [--frames 50]
 
 Makes the data set under benchmarks/runs/liver where it is not there, and trains the twin.
 """
@@ -26,24 +26,32 @@ from softtwin.registration.registrar import options_for
 RUNS = Path(__file__).parent / "runs"
 
 
-def liver_config(seconds: float, ranks: int) -> Config:
-    """Loads on the zones that the sequences allow, each at half of its size and whole."""
+def liver_config(seconds: float, ranks: int, draws: int = 1360) -> Config:
+    """Loads on the zones that the sequences allow, each at half of its size and whole; so many draws to learn from."""
+    held_out = max(48, 8 * (draws // 112))
     return Config.model_validate(
         {
             "folder": ".",
             "material": {"young_modulus": YOUNG_MODULUS, "poisson_ratio": POISSON_RATIO},
             "loads": {"zones": list(SEQUENCES), "patches": 1, "radius": (0.25, 0.8), "displacement": 0.1},
             # Many directions of load teach more than many sizes of each: 680 ramps of two, not 192 of eight.
-            "samples": {"train": 1360, "validation": 96, "test": 192, "block": 8, "ramp": 2, "ranks": ranks},
+            "samples": {
+                "train": draws,
+                "validation": held_out,
+                "test": held_out,
+                "block": 8,
+                "ramp": 2,
+                "ranks": ranks,
+            },
             "solver": {"tolerance": 1e-6, "max_iterations": 30, "max_load_steps": 6},
             "training": {"seconds": seconds, "width": 512},
         }
     )
 
 
-def make_twin(seconds: float, ranks: int, folder: Path) -> Workspace:
+def make_twin(seconds: float, ranks: int, folder: Path, draws: int) -> Workspace:
     """The liver's twin; a data set that is there is not made again."""
-    config = liver_config(seconds, ranks)
+    config = liver_config(seconds, ranks, draws)
     if (folder / "organ.toml").exists():  # its mesh came from no stage: `prepare` would not know it again
         space = Workspace(config, folder)
     else:
@@ -61,12 +69,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ranks", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=270.0)
+    parser.add_argument("--draws", type=int, default=1360, help="that the network learns from")
     parser.add_argument("--frames", type=int, default=50)
     parser.add_argument("--smoothness", type=float, default=0.02)
     parser.add_argument("--folder", type=Path, default=RUNS / "liver")
     parser.add_argument("--twin", type=Path, help="register with this finished twin instead of making one")
     arguments = parser.parse_args()
-    twin = arguments.twin or make_twin(arguments.seconds, arguments.ranks, arguments.folder).twin
+    twin = arguments.twin or make_twin(arguments.seconds, arguments.ranks, arguments.folder, arguments.draws).twin
     body = liver()
     model = load(twin, body)
     figures = {"smoothness": arguments.smoothness, "sequences": {}}
