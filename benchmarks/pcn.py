@@ -2,7 +2,7 @@
 
     softtwin quickstart --output FOLDER
     pip install -e '.[benchmark]'
-    python benchmarks/pcn.py FOLDER [--frames 10] [--length 5000] [--about laplace]
+    python benchmarks/pcn.py FOLDER [--frames 10] [--length 20000] [--about laplace]
 
 Fresh states of the quickstart's organ and clouds of 1,000 points as in margins.py, no zone told, from rest. The chain
 has the coefficients of forces and model error, whitened by their prior, and the likelihood that the registration ended
@@ -10,7 +10,7 @@ with: its robust loss at the noise and the force scale that were found, divided 
 Laplace's law is taken at the same scales, so that the two differ by what is not linear alone (the doubt of the force
 scale, which the product adds, is in neither). pCN proposes from the prior (--about prior: Cotter et al. 2013), whose
 steps are as short as the sharpest direction asks; about Laplace's law (Rudolf and Sprungk 2018) it has the same target,
-and a state tells far more. One likelihood costs some 20 ms: closest points are walked to anew.
+and a state tells far more.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--frames", type=int, default=10)
-    parser.add_argument("--length", type=int, default=5000, help="of each chain, after its step is tuned")
+    parser.add_argument("--length", type=int, default=20_000, help="of each chain, after its step is tuned")
     parser.add_argument("--about", choices=["laplace", "prior"], default="laplace", help="what proposals are made from")
     parser.add_argument("--scale", type=float, default=0.2, help="step of the chain to begin with, in (0, 1]")
     parser.add_argument("--name", default=NAME, help="of the record")
