@@ -1,0 +1,245 @@
+"""Laplace's posterior of a surrogate registration against a chain: preconditioned Crank-Nicolson (CUQIpy), ten frames.
+
+    softtwin quickstart --output FOLDER
+    pip install -e '.[benchmark]'
+    python benchmarks/pcn.py FOLDER [--frames 10] [--length 20000] [--about laplace]
+
+Fresh states of the quickstart's organ and clouds of 1,000 points as in margins.py, no zone told, from rest. The chain
+has the coefficients of forces and model error, whitened by their prior, and the likelihood that the registration ended
+with: its robust loss at the noise and the force scale that were found, divided by how many points tell what one would.
+Laplace's law is taken at the same scales, so that the two differ by what is not linear alone (the doubt of the force
+scale, which the product adds, is in neither). pCN proposes from the prior (--about prior: Cotter et al. 2013), whose
+steps are as short as the sharpest direction asks; about Laplace's law (Rudolf and Sprungk 2018) it has the same target,
+and a state tells far more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from margins import truths
+from numpy.typing import NDArray
+from record import recorded, stamp, write
+from threadpoolctl import threadpool_limits
+
+from softtwin.app.quickstart import CAMERA, NOISE, POINTS
+from softtwin.app.twin import Twin
+from softtwin.meshes.clouds import partial_view
+from softtwin.reference.data.dataset import DataSet
+from softtwin.registration.loss import Loss, Tukey
+from softtwin.registration.problem import Problem, Trial
+from softtwin.registration.registrar import Registration
+
+Floats = NDArray[np.float64]
+NAME = "pcn"
+KEPT = 2000  # states of the chain whose quantities are looked at
+WARM = 0.25  # part of the length before that, in which the step is tuned
+QUANTITIES = ("net force", "mean displacement")
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """What is known of the coefficients after a cloud, without normals or landmarks, at scales that are held.
+
+    Args:
+        problem: what was registered.
+        trial: where the solver ended.
+        scale: standard deviation of each coefficient beforehand, (k,).
+        noise: found, metres.
+        deviations: of the points, (p,), metres.
+        alike: so many points tell what one would.
+        loss: of each.
+    """
+
+    problem: Problem
+    trial: Trial
+    scale: Floats
+    noise: float
+    deviations: Floats
+    alike: float
+    loss: Loss
+
+    @classmethod
+    def of(cls, found: Registration, loss: Loss | None = None) -> Law:
+        """At the scales of a registration's posterior."""
+        problem, scales = found.problem, found.posterior.scales
+        scale = np.ones(problem.size)
+        scale[problem.force_part] = scales.force
+        deviations = np.hypot(scales.noise, problem.left_out(found.trial))
+        return cls(problem, found.trial, scale, scales.noise, deviations, found.alike, loss or Tukey())
+
+    def log_likelihood(self, whitened: Floats) -> float:
+        """Of coefficients over their scales beforehand, (k,), up to a constant."""
+        scaled = self.problem.residuals(self._trial(whitened), self.noise) / self.deviations
+        return -float(self.loss.value(scaled).sum()) / self.alike
+
+    def _trial(self, whitened: Floats) -> Trial:
+        return self.problem.trial(self.scale * whitened, self.trial)
+
+    @property
+    def mode(self) -> Floats:
+        """Where the solver ended, whitened, (k,)."""
+        return self.trial.coefficients / self.scale
+
+    def covariance(self) -> Floats:
+        """Laplace's, whitened, (k, k), with the weights that the product's has."""
+        scaled = self.problem.residuals(self.trial, self.noise) / self.deviations
+        trusted = np.sqrt(self.loss.weight(scaled) / self.alike) / self.deviations
+        slopes = trusted[:, None] * self.problem.jacobian(self.trial) * self.scale
+        return np.linalg.inv(slopes.T @ slopes + np.eye(len(self.scale)))
+
+    def quantities(self, whitened: Floats) -> Floats:
+        """Net force, newtons, and the nodes' mean displacement, metres, (6,)."""
+        problem, found = self.problem, self.scale * whitened
+        forces = found[problem.force_part]
+        moved = problem.model.solve(forces).full.displacement
+        if problem.error is not None:
+            moved = moved + problem.error.field(found[problem.error_part])
+        return np.concatenate([problem.forces.net_basis @ forces, moved.mean(axis=0)])
+
+    def slopes(self) -> Floats:
+        """Their derivative by the whitened coefficients at the mode, (6, k)."""
+        pushed = self.trial.state.full.push(self.problem.forces.basis)
+        blocks = [pushed.reshape(-1, 3, pushed.shape[1]).mean(axis=0)]
+        if self.problem.error is not None:
+            modes = self.problem.error.size * self.problem.error.discrepancy.modes
+            blocks.append(modes.reshape(-1, 3, modes.shape[1]).mean(axis=0))
+        return np.vstack([self.problem.net_forces(self.trial), np.hstack(blocks)]) * self.scale
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """What a chain has gone through.
+
+    Args:
+        states: whitened coefficients, (s, k).
+        acceptance: share of proposals that were taken.
+        seconds: wall time.
+    """
+
+    states: Floats
+    acceptance: float
+    seconds: float
+
+
+def walked(
+    log_likelihood: Callable[[Floats], float],
+    middle: Floats,
+    root: Floats,
+    length: int,
+    scale: float,
+    seed: int = 0,
+    start: Floats | None = None,
+) -> Chain:
+    """CUQIpy's pCN about a normal law, for a likelihood times the unit normal law.
+
+    Args:
+        log_likelihood: of the target over the unit normal law of whitened coefficients, (k,).
+        middle: of the law that proposals are made from, (k,).
+        root: of its covariance, (k, k).
+        length: states after those in which the step is tuned.
+        scale: step to begin with, in (0, 1].
+        seed: of the chain.
+        start: in deviations of the law, (k,); its middle if not given.
+    """
+    from cuqi.distribution import Gaussian, Posterior
+    from cuqi.likelihood import UserDefinedLikelihood
+    from cuqi.sampler import PCN
+
+    def against_the_law(v: Floats) -> float:
+        x = middle + root @ v
+        return log_likelihood(x) - 0.5 * float(x @ x) + 0.5 * float(v @ v)
+
+    np.random.seed(seed)  # noqa: NPY002  CUQIpy draws from it
+    count = len(middle)
+    prior = Gaussian(np.zeros(count), np.ones(count), name="v")
+    likelihood = UserDefinedLikelihood(dim=count, logpdf_func=lambda v: against_the_law(np.asarray(v)), name="y")
+    begun = time.perf_counter()
+    sampler = PCN(Posterior(likelihood, prior), scale=scale, initial_point=np.zeros(count) if start is None else start)
+    sampler.warmup(max(10, round(WARM * length)))
+    before = len(sampler._samples)
+    sampler.sample(length)
+    seconds = time.perf_counter() - begun
+    states = np.array(sampler._samples[before:])
+    moved = np.abs(np.diff(states, axis=0)).max(axis=1) > 0.0
+    return Chain(middle + states @ root.T, float(moved.mean()), seconds)
+
+
+def effective(values: Floats) -> float:
+    """How many independent values tell a mean as well as a chain's, (s,): Geyer's initial positive sequence (1992)."""
+    count, off = len(values), values - values.mean()
+    square = float(off @ off)
+    if square == 0.0:
+        return 1.0
+    padded = np.fft.rfft(off, 2 * count)
+    correlation = np.fft.irfft(padded * padded.conj())[:count] / square
+    pairs = correlation[: 2 * (count // 2)].reshape(-1, 2).sum(axis=1)
+    last = int(np.argmax(pairs <= 0.0)) if (pairs <= 0.0).any() else len(pairs)
+    return float(count / max(2.0 * pairs[:last].sum() - 1.0, 1.0 / count))
+
+
+def compared(law: Law, length: int, about: str, scale: float, seed: int) -> dict[str, Any]:
+    """Means and deviations by Laplace and by the chain, in SI units, and how much the chain tells."""
+    covariance, middle, root = law.covariance(), np.zeros_like(law.scale), np.eye(len(law.scale))
+    if about == "laplace":
+        middle, root = law.mode, np.linalg.cholesky(covariance)
+    start = np.linalg.solve(root, law.mode - middle)  # both chains begin where the solver has ended
+    chain = walked(law.log_likelihood, middle, root, length, scale, seed, start)
+    few = chain.states[:: max(1, length // KEPT)]
+    sampled = np.array([law.quantities(state) for state in few])
+    slopes = law.slopes()
+    laplace = law.quantities(law.mode), np.sqrt(np.diag(slopes @ covariance @ slopes.T))
+    found: dict[str, Any] = {
+        "unknowns": len(law.scale),
+        "acceptance": chain.acceptance,
+        "effective": min(effective(column) for column in sampled.T),
+        "seconds": chain.seconds,
+    }
+    for name, part in zip(QUANTITIES, (slice(0, 3), slice(3, 6)), strict=True):
+        mean, deviation = sampled.mean(axis=0)[part], sampled.std(axis=0)[part]
+        found[name] = {
+            "laplace": {"mean": laplace[0][part], "deviation": laplace[1][part]},
+            "chain": {"mean": mean, "deviation": deviation},
+            "apart": float(np.abs((mean - laplace[0][part]) / deviation).max()),  # in the chain's deviations
+            "ratio": float(np.exp(np.abs(np.log(laplace[1][part] / deviation)).max())),  # of deviations, the worst
+        }
+    return found
+
+
+def frame(twin: Twin, truth: Floats, seed: int) -> Registration:
+    """One of the frames, registered by the surrogate."""
+    rng = np.random.default_rng(seed)
+    return twin.register(partial_view(twin.body, truth, CAMERA, POINTS, NOISE, rng, surface="observed"), "")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--frames", type=int, default=10)
+    parser.add_argument("--length", type=int, default=20_000, help="of each chain, after its step is tuned")
+    parser.add_argument("--about", choices=["laplace", "prior"], default="laplace", help="what proposals are made from")
+    parser.add_argument("--scale", type=float, default=0.2, help="step of the chain to begin with, in (0, 1]")
+    parser.add_argument("--name", default=NAME, help="of the record")
+    arguments = parser.parse_args()
+    found, made = recorded(arguments.name), truths(DataSet(arguments.folder / "data.zarr"), arguments.frames)
+    with threadpool_limits(1), Twin.open(arguments.folder, "surrogate") as twin:
+        for number, (_, truth) in enumerate(made):
+            key = f"frame {number}, about {arguments.about}, {arguments.length} states"
+            if key not in found:
+                result = frame(twin, truth, number)
+                row = compared(Law.of(result), arguments.length, arguments.about, arguments.scale, number)
+                found[key] = {"verdict": result.judgement.verdict.value, **row, "made": stamp()}
+                write(arguments.name, found)
+            told = {name: value for name, value in found[key].items() if name not in ("made", *QUANTITIES)}
+            worst = {name: {kind: found[key][name][kind] for kind in ("apart", "ratio")} for name in QUANTITIES}
+            print(key, told, worst, sep="\n  ", flush=True)
+
+
+if __name__ == "__main__":
+    main()
