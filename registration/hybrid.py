@@ -59,26 +59,29 @@ class HybridRegistrar:
             cloud: observed points, (p, 3), metres.
             start: an earlier frame's result; its draft is where the fast model starts.
         """
-        return self._refined(cloud, lambda: self.fast.register(cloud, None if start is None else start.draft))
+        return self._refined(cloud, start, lambda: self.fast.register(cloud, None if start is None else start.draft))
 
     def follow(self, cloud: ArrayLike, last: Registration | None) -> Registration:
         """The next frame of a sequence, and from rest where that is not accepted; see `Registrar.follow`."""
-        return self._refined(cloud, lambda: self.fast.follow(cloud, None if last is None else last.draft))
+        return self._refined(cloud, last, lambda: self.fast.follow(cloud, None if last is None else last.draft))
 
-    def _refined(self, cloud: ArrayLike, drafted: Callable[[], Registration]) -> Registration:
+    def _refined(
+        self, cloud: ArrayLike, last: Registration | None, drafted: Callable[[], Registration]
+    ) -> Registration:
         begin = time.perf_counter()
         draft = drafted()
         draft = replace(draft, draft=draft)
-        return replace(self._best(cloud, draft), seconds=time.perf_counter() - begin)
+        return replace(self._best(cloud, draft, last), seconds=time.perf_counter() - begin)
 
-    def _best(self, cloud: ArrayLike, draft: Registration) -> Registration:
-        """The exact model's result, from the draft or from rest; where time was over before, the better of both."""
+    def _best(self, cloud: ArrayLike, draft: Registration, last: Registration | None) -> Registration:
+        """The exact model's result, from the frame before, the draft or rest; where time was over before, the best."""
         refined = None
-        if draft.judgement.is_usable and not self._is_late:
-            with suppress(NotConverged):
-                refined = self.exact.refine(cloud, draft)
-        if refined is not None and refined.judgement.verdict is Verdict.ACCEPTED:
-            return refined
+        for start in [None] if last is None else [last, None]:
+            if draft.judgement.is_usable and not self._is_late:
+                with suppress(NotConverged):
+                    refined = self.exact.refine(cloud, draft, start)
+            if refined is not None and refined.judgement.verdict is Verdict.ACCEPTED:
+                return refined
         if not self._is_late:
             alone = replace(self.exact.register(cloud), draft=draft)
             return alone if refined is None else min(refined, alone, key=badness)

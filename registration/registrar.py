@@ -403,12 +403,14 @@ class Registrar:
             return self._cold(points, begin)
         return result
 
-    def refine(self, cloud: ArrayLike, draft: Registration) -> Registration:
+    def refine(self, cloud: ArrayLike, draft: Registration, last: Registration | None = None) -> Registration:
         """What this model makes of a cloud, from what another model of the same body has found for it.
 
         Args:
             cloud: observed points, (p, 3), metres.
             draft: the other model's result, in which forces are sought where it has found them.
+            last: this model's result for the frame before, refined from a draft as well: it goes on from there by as
+                much as the other model has moved since, so that what that model always gets wrong does not matter.
 
         Raises:
             CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
@@ -416,6 +418,8 @@ class Registrar:
         """
         begin = time.perf_counter()
         points, solver = self._checked(cloud), self.options.solver.following()
+        if last is not None and last.draft is not None and last.draft.prepared is draft.prepared:
+            return replace(self._carried_on(points, draft, last, begin), draft=draft)
         forces = replace(draft.prepared.forces, scale=self.forces.scale)
         prepared = self._prepared(forces)
         problem = self._plain(points, prepared)
@@ -423,6 +427,16 @@ class Registrar:
         start[: problem.pose_part.stop] = draft.trial.coefficients[: problem.pose_part.stop]
         found = solver.solve(problem, start, problem.begun(start, draft.trial))
         return replace(self._finished(points, prepared, found, begin), draft=draft)
+
+    def _carried_on(self, points: Cloud, draft: Registration, last: Registration, begin: float) -> Registration:
+        assert last.draft is not None
+        problem = self._problem(points, last.prepared, last.trial, last.doubt)
+        start, both = last.coefficients.copy(), slice(0, problem.pose_part.stop)  # forces and pose
+        start[both] += draft.coefficients[both] - last.draft.coefficients[both]
+        solver, near = self.options.solver.following(), problem.begun(start, last.trial)
+        found = solver.solve(problem, near.coefficients, near)
+        problem, found, doubt = self._doubted(problem, found, last.doubt, solver)
+        return self._result(problem, found, last.prepared, begin, doubt)
 
     def follow(self, cloud: ArrayLike, last: Registration | None) -> Registration:
         """The next frame of a sequence: from the last one, and from rest where that is not accepted.

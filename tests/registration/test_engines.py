@@ -84,9 +84,9 @@ def test_all_engines_stop_by_one_rule_within_what_is_uncertain(body: Body, truth
     found, alone = same.register(cloud), exact.register(cloud)
     for result in (found, alone, found.draft):
         assert result is not None and result.outcome.is_success
-    whole = [np.sqrt(np.diag(result.posterior.covariance)) for result in (found, alone)]
-    apart = np.abs(found.coefficients - alone.coefficients) / np.maximum(*whole)
-    assert np.sqrt(np.mean(apart**2)) < 2.0 * rule.settled
+    # Each of the two may have a tenth to go in every direction, and forces may be gathered a little otherwise.
+    apart = np.abs(found.net_force - alone.net_force) / alone.net_force_deviation
+    assert np.sqrt(np.mean(apart**2)) < 3.0 * rule.settled
 
 
 def test_each_frame_starts_from_the_draft_of_the_one_before(body: Body, rng) -> None:
@@ -105,6 +105,25 @@ def test_each_frame_starts_from_the_draft_of_the_one_before(body: Body, rng) -> 
         counts.append(fast.asked)
     cold, warm = np.diff(counts)
     assert warm < cold
+
+
+def test_a_frame_goes_on_from_the_one_before_by_what_the_draft_has_moved(body: Body, rng) -> None:
+    """What the fast model always gets wrong is nothing to find again: the exact one needs fewer states, ends alike."""
+    model = Cantilever(body)
+    truths = [model.solve(tip_forces(body, tuple(part * np.array(NET)))).displacement for part in (0.9, 1.0)]
+    clouds = [cloud_on(body, truth, 300, rng, 5e-4) for truth in truths]
+    exact = Bent(body)
+    both = engine(Bent(body, 1.3), exact)
+    first = both.follow(clouds[0], None)
+    before = exact.asked
+    second = both.follow(clouds[1], first)
+    carried = exact.asked - before
+    assert second.draft is not None and first.draft is not None and second.draft.prepared is first.draft.prepared
+    anew = both.exact.refine(clouds[1], second.draft)
+    assert carried < exact.asked - before - carried
+    assert second.judgement.verdict is anew.judgement.verdict is Verdict.ACCEPTED
+    deviation = np.sqrt(np.diag(anew.net_force_covariance)[1:])
+    assert (np.abs(second.net_force - anew.net_force)[1:] < 0.3 * deviation).all()
 
 
 def test_a_pose_is_found_by_both(body: Body, truth: np.ndarray, rng) -> None:
