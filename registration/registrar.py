@@ -224,6 +224,11 @@ class Registration:
         return self.trial.coefficients
 
     @property
+    def unknown_forces(self) -> Floats:
+        """Nodal forces of the basis alone, (n, 3), newtons: without those of conditions."""
+        return self.prepared.forces.forces(self.coefficients[self.problem.force_part])
+
+    @property
     def displacement(self) -> Floats:
         """Of all nodes, (n, 3), metres, in the body's coordinates: the state's with the correction."""
         return self.state.displacement + self.correction
@@ -420,19 +425,24 @@ class Registrar:
         points, solver = self._checked(cloud), self.options.solver.following()
         if last is not None and last.draft is not None and last.draft.prepared is draft.prepared:
             return replace(self._carried_on(points, draft, last, begin), draft=draft)
-        forces = replace(draft.prepared.forces, scale=self.forces.scale)
-        prepared = self._prepared(forces)
+        # Told a zone, the exact model gathers no forces within it, and takes none that were: see `options_for`.
+        prepared = self._everywhere
+        if self.options.gathering.rounds:
+            prepared = self._prepared(replace(draft.prepared.forces, scale=self.forces.scale))
         problem = self._plain(points, prepared)
         start = np.zeros(problem.size)
-        start[: problem.pose_part.stop] = draft.trial.coefficients[: problem.pose_part.stop]
+        start[problem.force_part] = prepared.forces.nearest(draft.unknown_forces)
+        start[problem.pose_part] = draft.coefficients[draft.problem.pose_part]
         found = solver.solve(problem, start, problem.begun(start, draft.trial))
         return replace(self._finished(points, prepared, found, begin), draft=draft)
 
     def _carried_on(self, points: Cloud, draft: Registration, last: Registration, begin: float) -> Registration:
         assert last.draft is not None
         problem = self._problem(points, last.prepared, last.trial, last.doubt)
-        start, both = last.coefficients.copy(), slice(0, problem.pose_part.stop)  # forces and pose
-        start[both] += draft.coefficients[both] - last.draft.coefficients[both]
+        start, before = last.coefficients.copy(), last.draft
+        start[problem.force_part] += last.prepared.forces.nearest(draft.unknown_forces - before.unknown_forces)
+        poses = (each.coefficients[each.problem.pose_part] for each in (draft, before))
+        start[problem.pose_part] += np.subtract(*poses)
         solver, near = self.options.solver.following(), problem.begun(start, last.trial)
         found = solver.solve(problem, near.coefficients, near)
         problem, found, doubt = self._doubted(problem, found, last.doubt, solver)

@@ -76,6 +76,11 @@ class Forces:
         whole[self.nodes] = (self.patterns @ coefficients).reshape(len(self.nodes), 3)
         return whole
 
+    def nearest(self, nodal: Floats) -> Floats:
+        """Coefficients, (k,), of the forces of this kind that are nearest to nodal ones, (n, 3), newtons."""
+        found: Floats = np.linalg.lstsq(self.patterns, nodal[self.nodes].ravel(), rcond=None)[0]
+        return found
+
     def combined(self, kept: Floats) -> Forces:
         """The forces in orthonormal combinations of their directions; the net force of the others is left in doubt.
 
