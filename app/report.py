@@ -16,6 +16,7 @@ import jinja2
 import matplotlib
 import numpy as np
 import pyvista
+from markupsafe import Markup
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -152,9 +153,10 @@ def _square_millimetres(values: Sequence[float | None]) -> str:
     return "(" + ", ".join("–" if value is None else f"{1e6 * value:+.3g}" for value in values) + ")"
 
 
-def _interval(bounds: Sequence[Sequence[float | None]]) -> str:
+def _interval(bounds: Sequence[Sequence[float | None]]) -> Markup:
+    """A line for each component: in one they would be wider than a column of figures."""
     each = zip("xyz", bounds, strict=True)
-    return ", ".join(f"{axis} {_signed(low)} to {_signed(high)}" for axis, (low, high) in each)
+    return Markup("<br>".join(f"{axis} {_signed(low)} to {_signed(high)}" for axis, (low, high) in each))
 
 
 def _signed(value: float | None) -> str:
