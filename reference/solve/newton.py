@@ -164,7 +164,7 @@ class Newton:
         self._snes.setKSP(self.tangent.linear.ksp)
         self._load, self._factor = load, factor
         self._norms: list[float] = []
-        self._search_failed = False
+        self._search_failed, self._is_met = False, False
         self._eliminations = 0 if eliminate and self._can_eliminate else None
         self._length = 1.0
         self._reached: float | None = None  # potential where the last step led
@@ -176,6 +176,8 @@ class Newton:
             self._snes.solve(None, self._x)
         reason, iterations = int(self._snes.getConvergedReason()), self._snes.getIterationNumber()
         residual = float(self._norms[-1]) if self._norms else np.nan  # SNES gives up at once on a start inside out
+        if reason > 0 and not self._is_met:  # newer versions of PETSc take a step of no length for the end
+            reason = int(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
         return Attempt(np.array(self._x.array_r), reason > 0, reason, iterations, residual)
 
     def _start_tolerance(self, load: DiscreteLoad) -> None:
@@ -222,10 +224,9 @@ class Newton:
         )
         if not np.isfinite(norm):
             return reasons.DIVERGED_FNORM_NAN
-        if norm <= self._absolute_tolerance:
-            return reasons.CONVERGED_FNORM_ABS
-        if self._is_round_off(snes):
-            return reasons.CONVERGED_SNORM_RELATIVE
+        self._is_met = norm <= self._absolute_tolerance or self._is_round_off(snes)
+        if self._is_met:
+            return reasons.CONVERGED_FNORM_ABS if norm <= self._absolute_tolerance else reasons.CONVERGED_SNORM_RELATIVE
         if self._search_failed:
             return reasons.DIVERGED_LINE_SEARCH
         return reasons.DIVERGED_MAX_IT if iteration >= self.options.max_iterations else reasons.ITERATING
