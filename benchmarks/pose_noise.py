@@ -13,28 +13,21 @@ likely the mean square, m^2: 2.5 to 2.7 mm) and 28.0 +- 0.8 to 32.2 +- 7.7 % of 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from liver import POISSON_RATIO, YOUNG_MODULUS, liver, sequence
+from liver import sequence
 from networks import RUNS
 from numpy.typing import NDArray
 from record import recorded, stamp, write
-from robustness import registrar_for
+from robustness import forward_model, registrar_for
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
-from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.outcome import NotConverged
-from softtwin.reference.derivatives.model import ReferenceModel
-from softtwin.reference.solve.problem import NewtonOptions, Problem
-from softtwin.registration.forward import ForwardModel
 from softtwin.registration.pose import Pose
 from softtwin.registration.unknowns import PosePrior
-from softtwin.surrogate.twin import load as load_twin
 
 Floats = NDArray[np.float64]
 NAME = "pose_noise"
@@ -42,17 +35,6 @@ SEQUENCE, FRAME = "s3", 25  # the thesis does not say which frame of which of it
 LEVELS = tuple(np.round(np.linspace(1e-4, 1e-3, 10), 5).tolist())
 POSES = ("pose as it is", "pose unknown")
 _TURN, _SHIFT = np.deg2rad(1.0), 3e-3  # expected of an unknown pose: the largest level turns by 0.06 degrees
-
-
-@contextmanager
-def model_of(engine: str, twin: Path) -> Iterator[ForwardModel]:
-    body = liver()
-    if engine == "surrogate":
-        yield load_twin(twin, body)
-        return
-    newton = NewtonOptions(tolerance=1e-5, max_iterations=15)
-    with Problem(body, NeoHookean(YOUNG_MODULUS, POISSON_RATIO), newton) as problem:
-        yield ReferenceModel(problem, patient=False)
 
 
 def spread(values: Floats) -> dict[str, float]:
@@ -107,7 +89,7 @@ def main() -> None:
     found, data = recorded(arguments.name), sequence(SEQUENCE)
     for engine in arguments.engines:
         draws = arguments.draws if engine == "surrogate" else arguments.reference_draws
-        with threadpool_limits(1), model_of(engine, arguments.twin) as model:
+        with threadpool_limits(1), forward_model(engine, arguments.twin) as model:
             for kind in POSES:
                 has_pose = kind == POSES[1]
                 prior = PosePrior(Pose.identity(), model.body.points.mean(axis=0), _TURN, _SHIFT) if has_pose else None
