@@ -157,6 +157,17 @@ class GaussNewton:
         """
         return _Search(self, problem, start, near).run()
 
+    def has_settled(self, problem: Problem, trial: Trial, noise: float) -> bool:
+        """Whether no step would be taken from a trial, its closest points left as they are.
+
+        Args:
+            problem: what is registered.
+            trial: where.
+            noise: standard deviation of a point's distance as far as it is known, metres.
+        """
+        local = LocalModel(problem, trial, self.losses[-1], noise, self.graduation)
+        return local.length < self.settled and not local.is_graduated
+
 
 class _Search:
     """One run of the solver: where it is, how far it may step, what it has seen."""

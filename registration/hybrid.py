@@ -79,7 +79,7 @@ class HybridRegistrar:
         for start in [None] if last is None else [last, None]:
             if draft.judgement.is_usable and not self._is_late:
                 with suppress(NotConverged):
-                    refined = self.exact.refine(cloud, draft, start)
+                    refined = self.exact.refine(cloud, draft, self.fast.model, start)
             if refined is not None and refined.judgement.verdict is Verdict.ACCEPTED:
                 return refined
         if not self._is_late:

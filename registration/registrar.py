@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,7 @@ from softtwin.meshes.clouds import check_cloud
 from softtwin.meshes.metrics import edge_lengths
 from softtwin.reference.data.outcome import NotConverged
 
+from .anchored import Anchored
 from .cloud import Cloud
 from .conditions import Conditions, Estimate
 from .evidence import Scale
@@ -51,6 +52,7 @@ _MANY = 10_000  # points: of no cloud that is left after thinning are there more
 _CLEAR, _LOUD = 2.0, 1.5  # times the least noise, times the model's error
 _CLOSE = 0.01  # reach of a surrogate's forces whose zone is unknown: with more, their doubt is larger than their error
 _LEADING = 6  # directions of force that a cold start begins with
+_ANCHORS = 3  # exact states from which a fast model goes on
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
 
 
@@ -322,6 +324,7 @@ class Registrar:
         self.noise = self.options.noise.at_least(model.error)
         self.expectations = expectations or Expectations.of(model, self.noise)
         self._everywhere = self._prepared(forces)
+        self._fast: tuple[ForwardModel, Forces, ReducedModel] | None = None
 
     def _prepared(self, forces: Forces) -> Prepared:
         return Prepared.of(self.model, self.observed, forces, self.conditions)
@@ -408,14 +411,19 @@ class Registrar:
             return self._cold(points, begin)
         return result
 
-    def refine(self, cloud: ArrayLike, draft: Registration, last: Registration | None = None) -> Registration:
-        """What this model makes of a cloud, from what another model of the same body has found for it.
+    def refine(
+        self, cloud: ArrayLike, draft: Registration, fast: ForwardModel, last: Registration | None = None
+    ) -> Registration:
+        """What this model makes of a cloud, from what a faster model of the same body has found for it.
+
+        Most of the way is the faster model's, moved to this one's states (see `Anchored`); the end is this one's.
 
         Args:
             cloud: observed points, (p, 3), metres.
-            draft: the other model's result, in which forces are sought where it has found them.
-            last: this model's result for the frame before, refined from a draft as well: it goes on from there by as
-                much as the other model has moved since, so that what that model always gets wrong does not matter.
+            draft: the faster model's result, in which forces are sought where it has found them.
+            fast: that model.
+            last: this model's result for the frame before, from which it goes on where forces are sought in the same
+                place.
 
         Raises:
             CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
@@ -424,7 +432,7 @@ class Registrar:
         begin = time.perf_counter()
         points, solver = self._checked(cloud), self.options.solver.following()
         if last is not None and last.draft is not None and last.draft.prepared is draft.prepared:
-            return replace(self._carried_on(points, draft, last, begin), draft=draft)
+            return replace(self._carried_on(points, fast, last, begin), draft=draft)
         # Told a zone, the exact model gathers no forces within it, and takes none that were: see `options_for`.
         prepared = self._everywhere
         if self.options.gathering.rounds:
@@ -433,20 +441,48 @@ class Registrar:
         start = np.zeros(problem.size)
         start[problem.force_part] = prepared.forces.nearest(draft.unknown_forces)
         start[problem.pose_part] = draft.coefficients[draft.problem.pose_part]
-        found = solver.solve(problem, start, problem.begun(start, draft.trial))
+        found = self._approached(problem, problem.begun(start, draft.trial), fast, solver)
         return replace(self._finished(points, prepared, found, begin), draft=draft)
 
-    def _carried_on(self, points: Cloud, draft: Registration, last: Registration, begin: float) -> Registration:
-        assert last.draft is not None
+    def _carried_on(self, points: Cloud, fast: ForwardModel, last: Registration, begin: float) -> Registration:
         problem = self._problem(points, last.prepared, last.trial, last.doubt)
-        start, before = last.coefficients.copy(), last.draft
-        start[problem.force_part] += last.prepared.forces.nearest(draft.unknown_forces - before.unknown_forces)
-        poses = (each.coefficients[each.problem.pose_part] for each in (draft, before))
-        start[problem.pose_part] += np.subtract(*poses)
-        solver, near = self.options.solver.following(), problem.begun(start, last.trial)
-        found = solver.solve(problem, near.coefficients, near)
+        solver = self.options.solver.following()
+        found = self._approached(problem, last.trial, fast, solver)
         problem, found, doubt = self._doubted(problem, found, last.doubt, solver)
         return self._result(problem, found, last.prepared, begin, doubt)
+
+    def _approached(self, problem: Problem, near: Trial, fast: ForwardModel, solver: GaussNewton | LBFGS) -> Found:
+        """The minimum, to which the fast model knows most of the way from any trial of the exact one.
+
+        A fast model takes no conditions: with them, and where the exact one finds no state, the way is the latter's, as
+        it is of L-BFGS, which wants the whole body's slopes.
+        """
+        spent: list[Found] = []
+        for _ in range(_ANCHORS):
+            if problem.conditions is not None or not isinstance(solver, GaussNewton):
+                break
+            place = near.coefficients[problem.force_part]
+            reduced = self._reduced(fast, problem.forces)
+            cheap = replace(problem, model=Anchored.at(reduced, self.observed.nodes, place, near.state))
+            way = solver.solve(cheap, near.coefficients, cheap.begun(near.coefficients))
+            if not way.trace or time.monotonic() >= solver.until:
+                break
+            try:
+                near = problem.trial(way.trial.coefficients, way.trial)
+            except NotConverged:
+                break
+            spent.append(replace(way, evaluations=1))  # states of the exact model alone are counted
+            if solver.has_settled(problem, near, way.posterior.scales.noise):
+                break
+        if near.cloud is not problem.cloud:
+            near = problem.begun(near.coefficients.copy(), near)
+        return reduce(_after, [*spent, solver.solve(problem, near.coefficients, near)])
+
+    def _reduced(self, fast: ForwardModel, forces: Forces) -> ReducedModel:
+        """The fast model between this one's forces and the observed nodes; that of the last forces is kept."""
+        if self._fast is None or self._fast[0] is not fast or self._fast[1] is not forces:
+            self._fast = fast, forces, reduce_model(fast, self.observed.nodes, forces.basis)
+        return self._fast[2]
 
     def follow(self, cloud: ArrayLike, last: Registration | None) -> Registration:
         """The next frame of a sequence: from the last one, and from rest where that is not accepted.
@@ -721,10 +757,10 @@ def prepare(
 def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> RegistrationOptions:
     """Options that suit a model.
 
-    An exact model is only as good as the end of the descent; within a zone its forces are not gathered, since what a
-    cloud was used to believe it would be used to find once more. What a surrogate gets wrong could be taken for large
-    forces: it is left to clouds of more noise than that to tell their size. But where the pose is unknown, forces that
-    are expected small would be taken for a turn of the organ, which is worse.
+    Within a zone forces are not gathered: what a cloud was used to believe it would be used to find once more, and
+    margins would be too narrow. An exact model is only as good as the end of the descent. What a surrogate gets wrong
+    could be taken for large forces: it is left to clouds of more noise than that to tell their size. But where the
+    pose is unknown, forces that are expected small would be taken for a turn of the organ, which is worse.
 
     Args:
         model: forward model.
@@ -736,7 +772,8 @@ def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> 
         gathering = Gathering(rounds=0 if has_zone else Gathering.rounds, points=_MANY)
         return RegistrationOptions(gathering=gathering, belief=Belief(clear))
     if has_zone:
-        return RegistrationOptions(belief=Belief(clear if has_pose else 0.0, loud))
+        belief = Belief(clear if has_pose else 0.0, loud)
+        return RegistrationOptions(gathering=Gathering(rounds=0, points=_MANY), belief=belief)
     return RegistrationOptions(gathering=Gathering(reach=_CLOSE), belief=Belief(loud=loud, spread=_SPREAD_ANYWHERE))
 
 

@@ -119,7 +119,7 @@ def test_a_frame_goes_on_from_the_one_before_by_what_the_draft_has_moved(body: B
     second = both.follow(clouds[1], first)
     carried = exact.asked - before
     assert second.draft is not None and first.draft is not None and second.draft.prepared is first.draft.prepared
-    anew = both.exact.refine(clouds[1], second.draft)
+    anew = both.exact.refine(clouds[1], second.draft, both.fast.model)
     assert carried < exact.asked - before - carried
     assert second.judgement.verdict is anew.judgement.verdict is Verdict.ACCEPTED
     deviation = np.sqrt(np.diag(anew.net_force_covariance)[1:])
