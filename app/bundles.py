@@ -21,7 +21,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLPolyDataWriter
 
 from softtwin.meshes.export import PER_METRE, Coordinates
-from softtwin.meshes.files import FileError, add_words
+from softtwin.meshes.files import FileError, add_words, discard
 
 _VERSION = "Slicer5.6.0"  # whose way of writing scenes this is
 _LENGTHS = "displacement"  # an array that is a length
@@ -168,7 +168,7 @@ def _write(path: Path, root: str, scene: ElementTree.Element, files: Mapping[str
                 bundle.writestr(f"{root}/{name}", content)
         os.replace(partial, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        discard(partial)
         raise FileError(f"{path}: could not be written ({error}).") from None
 
 

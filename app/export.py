@@ -41,11 +41,12 @@ class Exporter:
         twin: the twin.
         folder: to write to; it is there.
         formats: `vtu` for the whole organ with displacement and force; `stl`, `ply`, `obj`, `vtp` for the surfaces;
-            `nrrd` for the displacement field in both directions; `mrk.json` for the inner structures as points with
-            their margins; `seq.mrb` for the surfaces of all frames as sequences (which brings `vtp` along).
+            `nrrd` for the displacement field in both directions, unless a frame is refused; `mrk.json` for the inner
+            structures as points with their margins; `seq.mrb` for the surfaces of all frames as sequences (which
+            brings `vtp` along).
 
     Raises:
-        ConfigError: an unknown format, or points of inner structures of a twin that has none.
+        ConfigError: an unknown format, points of inner structures of a twin that has none, or too small a voxel.
     """
 
     twin: Twin
@@ -61,6 +62,9 @@ class Exporter:
                 f"Exporter.formats: expected a twin with inner structures for {TARGETS} (softtwin build --inner "
                 "NAME=FILE), got one without."
             )
+
+        if FIELD in self.formats:
+            _check_voxel(self.twin)
 
     @property
     def place(self) -> Coordinates:
@@ -100,7 +104,7 @@ class Exporter:
             names.append(f"{CLOUD}_{number:04d}.vtp")
             seen = self.place.lengths(result.pose.inverse().apply(cloud))
             write_points(self.folder / names[-1], seen, place=self.place)
-        if FIELD in self.formats:
+        if FIELD in self.formats and result.judgement.is_usable:  # nobody is to move images by another
             names += self._write_fields(number, result)
         if TARGETS in self.formats:
             names.append(f"{POINTS}_{number:04d}.{TARGETS}")
@@ -174,6 +178,16 @@ class Exporter:
             return []
         write_scene(self.folder / SCENE, self.folder, tracks, self.place)
         return [*(track.file for track in tracks), SCENE]
+
+
+def _check_voxel(twin: Twin) -> None:
+    """Refuse voxels of which there would be too many; a deformed organ may be twice as long as at rest."""
+    from softtwin.meshes.displacement import MOST_VOXELS  # pynrrd, which is missed before the first frame
+
+    least = 2.0 * float(np.ptp(twin.body.points, axis=0).max()) / MOST_VOXELS
+    edge = twin.config.registration.voxel
+    if 0.0 < edge < least:
+        raise ConfigError(f"registration.voxel: expected 0 or at least {least:.2g} m for this organ, got {edge:g} m.")
 
 
 def _part(file: str) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Surface
 from softtwin.meshes.embedding import Embedding
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import Axes, FileError
+from softtwin.meshes.files import Axes, FileError, discard
 from softtwin.registration.registrar import Registration
 from softtwin.registration.verdict import Verdict
 
@@ -156,7 +156,7 @@ def write_targets(path: Path, targets: list[Target], axes: Axes) -> None:
         partial.write_text(text + "\n")
         os.replace(partial, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        discard(partial)
         raise FileError(f"{path}: could not be written ({error.strerror}).") from None
 
 

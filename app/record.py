@@ -54,6 +54,8 @@ class Recorder:
 
     def __exit__(self, *error: object) -> None:
         self.write()
+        if error[0] not in (None, KeyboardInterrupt):  # what went wrong is to be said, not what would go wrong next
+            return
         bundles = self.exporter.write_bundles((row["frame"], row["files"]) for row in self._usable())
         if bundles:
             self.header["bundles"] = bundles

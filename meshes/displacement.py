@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
@@ -20,11 +21,11 @@ from vtkmodules.vtkFiltersCore import vtkProbeFilter
 from .body import Body, Floats, Surface
 from .closest import closest_points
 from .export import Coordinates
-from .files import FileError, unstructured_grid
+from .files import FileError, discard, unstructured_grid
 
 Direction = Literal["forward", "inverse"]
 VOXELS = 64  # along the organ's longest side, where no spacing is told
-_MOST = 512  # along any side: more would be gigabytes
+MOST_VOXELS = 512  # along any side: more would be gigabytes
 _RIM = 2  # voxels about the organ that carry its surface's movement on
 _SPACES: Mapping[str, str] = {"lps": "left-posterior-superior", "ras": "right-anterior-superior"}
 _MEANINGS: Mapping[str, str] = {
@@ -215,10 +216,10 @@ def _field(direction: Direction, body: Body, nodes: Floats, vectors: Floats, spa
     """Vectors of the nodes, which lie where they are asked for, at the voxels about them."""
     edge = spacing or float(np.ptp(body.points, axis=0).max()) / VOXELS
     low, high = nodes.min(axis=0) - (_RIM + 1) * edge, nodes.max(axis=0) + (_RIM + 1) * edge
-    if not 0.0 < edge < np.inf or (high - low).max() / edge > _MOST:
+    if not 0.0 < edge < np.inf or (high - low).max() / edge > MOST_VOXELS:
         raise ValueError(
-            f"spacing: expected an edge in metres of at least {(high - low).max() / _MOST:.2g}, got {spacing:g}: "
-            f"more than {_MOST} voxels along a side."
+            f"spacing: expected an edge in metres of at least {(high - low).max() / MOST_VOXELS:.2g}, got {spacing:g}: "
+            f"more than {MOST_VOXELS} voxels along a side."
         )
     counts = np.ceil((high - low) / edge).astype(int) + 1
     found, inside = _probed(body, nodes, vectors, low, edge, counts)
@@ -272,7 +273,7 @@ def _write(path: Path, data: NDArray[Any], header: Mapping[str, Any]) -> None:
         nrrd.write(str(partial), data, dict(header), index_order="F")
         os.replace(partial, path)
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        discard(partial)
         raise FileError(
             f"{path}: could not be written; is the folder there, and is the disk full? ({error})."
         ) from None
@@ -281,7 +282,7 @@ def _write(path: Path, data: NDArray[Any], header: Mapping[str, Any]) -> None:
 def _read(path: Path) -> tuple[NDArray[Any], dict[str, Any]]:
     try:
         data, header = nrrd.read(str(path), index_order="F")
-    except (OSError, ValueError, nrrd.NRRDError) as error:
+    except (OSError, ValueError, EOFError, StopIteration, zlib.error, nrrd.NRRDError) as error:
         raise FileError(f"{path}: could not be read as nrrd; the file may be missing, truncated or damaged "
                         f"({error}).") from None  # fmt: skip
     return data, dict(header)

@@ -24,7 +24,7 @@ from vtkmodules.vtkIOPLY import vtkPLYWriter
 from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
 from .body import Floats, Ints, Surface
-from .files import Axes, FileError, Unit, add_words
+from .files import Axes, FileError, Unit, add_words, discard, vtk_messages
 
 SURFACE_FORMATS = ("stl", "ply", "obj", "vtp")
 PER_METRE: Mapping[str, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
@@ -156,7 +156,7 @@ def _write(path: Path, data: vtkPolyData, place: Coordinates | None) -> None:
     except OSError:
         written = False
     if not written or not partial.is_file():
-        partial.unlink(missing_ok=True)
+        discard(partial)
         raise FileError(f"{path}: could not be written; is the folder there, and is the disk full?")
     os.replace(partial, path)
 
@@ -180,7 +180,8 @@ def _by_vtk(path: Path, data: vtkPolyData, place: Coordinates | None) -> bool:
         for word in str(place).split():
             writer.AddComment(word)
     writer.SetInputData(data)
-    return bool(writer.Write())
+    with vtk_messages():
+        return bool(writer.Write())
 
 
 def _as_text(path: Path, data: vtkPolyData, place: Coordinates | None) -> bool:

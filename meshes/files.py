@@ -380,6 +380,16 @@ def _known(path: str | Path, unit: Unit | None, axes: Axes | None) -> tuple[Unit
     return unit or stated_unit(path) or "m", axes or stated_axes(path) or "lps"
 
 
+def discard(partial: Path) -> None:
+    """Remove what was written of a file that could not be finished.
+
+    Args:
+        partial: it; it may not be there, nor its folder.
+    """
+    with contextlib.suppress(OSError):
+        partial.unlink()
+
+
 def _existing(path: str | Path) -> Path:
     path = Path(path)
     if not path.is_file():
@@ -484,7 +494,8 @@ def _from_meshio(path: Path) -> _Mesh:
 
 
 @contextlib.contextmanager
-def _vtk_messages() -> Iterator[vtkStringOutputWindow]:
+def vtk_messages() -> Iterator[vtkStringOutputWindow]:
+    """What VTK says meanwhile, which it would print."""
     window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
     loudness = vtkLogger.GetCurrentVerbosityCutoff()
     vtkOutputWindow.SetInstance(window)
@@ -499,7 +510,7 @@ def _vtk_messages() -> Iterator[vtkStringOutputWindow]:
 def _read_vtk(path: Path) -> Any:
     reader = _VTK[path.suffix.lower()]()
     reader.SetFileName(str(path))
-    with _vtk_messages() as window:
+    with vtk_messages() as window:
         reader.Update()
         data = reader.GetOutput()
         said = " ".join(window.GetOutput().split())
@@ -695,10 +706,10 @@ def _write(path: Path, grid: vtkUnstructuredGrid) -> None:
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()
     writer.EncodeAppendedDataOff()
-    with _vtk_messages() as window:
+    with vtk_messages() as window:
         written = writer.Write()
         said = " ".join(window.GetOutput().split())
     if not written or said:
-        partial.unlink(missing_ok=True)
+        discard(partial)
         raise FileError(f"{path}: could not be written; is the folder there, and is the disk full? ({said[:200]}).")
     os.replace(partial, path)
