@@ -15,7 +15,7 @@ import click
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.attachment import File, parse_file, parse_regions
-from softtwin.meshes.files import Unit, stated_axes
+from softtwin.meshes.files import Unit, stated_axes, stated_unit
 from softtwin.reference.ranks import FailedElsewhere
 
 from .config import LAWS, Config, ConfigError, parse_config, to_toml
@@ -280,8 +280,16 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
 @click.option("--pose-turn", type=float, help="How far an unknown pose may turn from its start, degrees.")
 @click.option("--pose-shift", type=float, help="How far an unknown pose may shift from its start, metres.")
 @click.option(
-    "--format", "formats", multiple=True, help="stl, ply, vtp: surfaces; vtu: all (may be repeated).  [vtu, vtp]"
+    "--format",
+    "formats",
+    multiple=True,
+    help="vtu: the organ; stl, ply, obj, vtp: surfaces; nrrd: displacement field; mrk.json: targets; seq.mrb: "
+    "sequences (may be repeated).  [vtu, vtp]",
 )
+@click.option("--frame", type=click.Choice(["lps", "ras", "source"]), help="Axes of the results.  [lps]")
+@click.option("--output-unit", type=click.Choice(["mm", "m", "source"]), help="Unit of the results' files.  [mm]")
+@click.option("--voxel", type=float, help="Edge of a voxel of the displacement field, metres; 0: 64 along the organ.")
+@click.option("--target-points", type=int, help="Points of each inner surface in mrk.json, beside its centre.")
 @click.option("--truth", type=_EXISTING, help="True node positions in .npy, metres, (frames, n, 3), to state errors.")
 @click.option("--budget", type=float, help="Seconds for a frame, after which the best so far is taken.")
 @click.option("--watch", is_flag=True, help="CLOUDS is a folder that is written to: register the newest, until Ctrl-C.")
@@ -308,8 +316,9 @@ def register(
     """Register CLOUDS to TWIN: one file a frame, in order; a folder; or a pattern in quotes.
 
     Every frame has a verdict: accepted, doubtful or refused, with reasons. Written to the folder: registration.json,
-    and for each frame the organ with displacement and force (VTU) and the moved surface of each structure, in the
-    unit and on the axes of the organ's files; frames.pvd opens all of it in ParaView.
+    and for each frame the organ with displacement and force (VTU) and the moved surface of each structure, in
+    millimetres and LPS (--output-unit, --frame); frames.pvd opens all of it in ParaView, and with --format seq.mrb
+    frames.mrb in 3D Slicer. Clouds are read in the unit and on the axes of the organ's files (--unit).
 
     TWIN is a twin's folder; with --model reference a folder with a body and its configuration is enough.
     """
@@ -422,7 +431,7 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 @click.option(
     "--fixed-distance", type=float, default=0.0, help="How near to a file of --fixed a node is fixed, m; 0: one cell."
 )
-@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the files.")
+@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the files that state none.  [m]")
 @click.option(
     "--frame",
     type=click.Choice(["lps", "ras"], case_sensitive=False),
@@ -494,7 +503,8 @@ def build(
         "zones": _named("--zone", zones),
         "inner": _named("--inner", inner),
         "frame": given["frame"] or "",
-        **{name: given[name] for name in ("unit", "nodes", "cell_size", "grid", "fixed_distance")},
+        "unit": given["unit"] or _stated_unit(surface_or_mesh) or "m",
+        **{name: given[name] for name in ("nodes", "cell_size", "grid", "fixed_distance")},
     }
     entries = {
         "folder": ".",
@@ -529,6 +539,12 @@ def _with_axes(source: str) -> str:
     """The source with the axes that it states about itself, so that the configuration holds it."""
     file = parse_file(source)
     return str(file if file.axes else replace(file, axes=stated_axes(file.path)))
+
+
+def _stated_unit(source: Path) -> Unit | None:
+    """The unit that a source states about itself; None for one that is yet to be looked for."""
+    path = parse_file(str(source)).path
+    return stated_unit(path) if path.is_file() else None
 
 
 def _resolved(where: str) -> str:

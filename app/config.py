@@ -279,6 +279,18 @@ class RegistrationSection(_Section):
     landmark_deviation: Positive = Field(
         0.002, description="standard deviation of where landmarks were found that pull beside the clouds, metres"
     )
+    frame: Literal["lps", "ras", "source"] = Field(
+        "lps", description="axes of what is written; source: of the organ's files, on which clouds are read in any case"
+    )
+    output_unit: Literal["mm", "m", "source"] = Field(
+        "mm", description="unit of what is written; source: of the organ's files (nrrd, mrk.json and seq.mrb: mm)"
+    )
+    voxel: float = Field(
+        0.0, ge=0.0, description="edge of a voxel of a displacement field (nrrd), metres; 0: 64 along the organ"
+    )
+    target_points: int = Field(
+        0, ge=0, description="points of the surface of each inner structure in mrk.json, beside its centre"
+    )
 
     @model_validator(mode="after")
     def _unknowns_can_be_found(self) -> RegistrationSection:
@@ -350,6 +362,16 @@ def files_axes(section: BodySection) -> Axes | None:
         section: the configuration's [body].
     """
     return parse_file(section.source).axes or section.frame or None
+
+
+def axes_unknown(section: BodySection) -> bool:
+    """Whether nobody says the axes of the files that a body was made from, so that they are taken as LPS.
+
+    Args:
+        section: the configuration's [body].
+    """
+    is_file = bool(parse_file(section.source).path.suffix)  # shapes are made in LPS
+    return is_file and files_axes(section) is None
 
 
 def read_config(path: Path | str) -> tuple[Config, Path]:

@@ -33,6 +33,7 @@ from softtwin.meshes.files import (
     read_mesh,
     read_surface,
     stated_axes,
+    stated_unit,
 )
 from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam, liver_phantom, propeller
@@ -70,10 +71,10 @@ class _Reader:
     axes: Axes | None
 
     def options(self, file: File) -> tuple[Path, Unit, Axes]:
-        """Path, unit and axes to read a file with; one that says no axes has those of the source."""
+        """Path, unit and axes to read a file with; one that says none has those of the source."""
         path = self.root / file.path
         axes = file.axes or stated_axes(path) or self.axes
-        return path, file.unit or self.unit, axes if axes and self.axes else "lps"
+        return path, file.unit or stated_unit(path) or self.unit, axes if axes and self.axes else "lps"
 
 
 def make_body(section: BodySection, root: Path) -> Body:
@@ -99,7 +100,7 @@ def make_organ(section: BodySection, root: Path) -> Organ:
         body = SHAPES[section.source](**_shape_options(section))
     else:
         source = parse_file(section.source)
-        _check_stated_axes(section, root)
+        _check_stated(section, root)
         reader = _Reader(root, section.unit, files_axes(section))
         points, cells, notes = _solid(section, reader, source)
         body = Body(points, cells, {})
@@ -139,14 +140,21 @@ def _on_grid(body: Body, edge: float) -> tuple[Body, str]:
     return grid, f"grid: {len(grid.cells)} hexahedra of {1e3 * edge:g} mm, {share:.4f} of the volume"
 
 
-def _check_stated_axes(section: BodySection, root: Path) -> None:
-    """Refuse a source in RAS whose configuration does not say so: clouds would be read on other axes later.
+def _check_stated(section: BodySection, root: Path) -> None:
+    """Refuse a source in RAS, or in another unit, where the configuration does not say so: clouds are read like it.
 
     Raises:
         ConfigError: with what to write.
     """
-    path = root / parse_file(section.source).path
-    if path.is_file() and stated_axes(path) == "ras" and files_axes(section) is None:
+    source = parse_file(section.source)
+    path = root / source.path
+    if not path.is_file():
+        return
+    if source.unit is None and (unit := stated_unit(path)) not in (None, section.unit):
+        raise ConfigError(
+            f'body.unit: {path} states that it is in {unit}, got {section.unit!r}; write unit = "{unit}".'
+        )
+    if stated_axes(path) == "ras" and files_axes(section) is None:
         raise ConfigError(
             f"body.source: {path} states that it is in RAS, which the configuration must say for what comes later: "
             f'write source = "{section.source}:ras".'

@@ -19,6 +19,7 @@ from softtwin.registration.conditions import WITHIN_90
 from softtwin.registration.registrar import Registration
 from softtwin.registration.verdict import Verdict
 
+from .config import axes_unknown
 from .export import SERIES, Exporter
 from .twin import Frame, Twin
 
@@ -53,6 +54,12 @@ class Recorder:
 
     def __exit__(self, *error: object) -> None:
         self.write()
+        if error[0] not in (None, KeyboardInterrupt):  # what went wrong is to be said, not what would go wrong next
+            return
+        bundles = self.exporter.write_bundles((row["frame"], row["files"]) for row in self._usable())
+        if bundles:
+            self.header["bundles"] = bundles
+            self.write()
 
     def add(self, frame: Frame, cloud: str = "", **more: Any) -> dict[str, Any]:
         """Write a frame's files and enter its figures, which are returned.
@@ -78,8 +85,7 @@ class Recorder:
     def write(self) -> None:
         """Write the record, and the time series of the frames not refused, each whole or not at all."""
         begin = time.monotonic()
-        usable = (row for row in self.rows if row["verdict"] != Verdict.REFUSED.value)
-        series = self.exporter.write_series((row["frame"], row["files"]) for row in usable)
+        series = self.exporter.write_series((row["frame"], row["files"]) for row in self._usable())
         content = {**self.header, "counts": counts(self.rows), "series": series, "frames": self.rows}
         path = self.exporter.folder / RECORD
         partial = path.with_name(f".{RECORD}.partial")
@@ -88,29 +94,50 @@ class Recorder:
         now = time.monotonic()
         self._due = now + max(_EVERY, (now - begin) / _SHARE)
 
+    def _usable(self) -> list[dict[str, Any]]:
+        return [row for row in self.rows if row["verdict"] != Verdict.REFUSED.value]
+
 
 def _header(twin: Twin, zone: str | None) -> dict[str, Any]:
-    place, section = twin.coordinates, twin.config.registration
+    place, own, section = twin.written_in, twin.coordinates, twin.config.registration
     options = section.model_dump() | ({} if zone is None else {"zone": zone})
     return {
         "notice": NOTICE,
-        "format": 2,
+        "format": 3,
         "body": twin.body.fingerprint,
         "files_in": {"unit": place.unit, "axes": place.axes},
+        "figures_in": {"unit": "m", "axes": place.axes},
+        "pose_in": {"unit": "m", "axes": own.axes},
+        "source_in": {"unit": own.unit, "axes": own.axes},
+        "notes": notes_on(twin),
         "options": options,
         **({"doubt": dict(twin.otherwise)} if twin.otherwise else {}),
     }
 
 
+def notes_on(twin: Twin) -> list[str]:
+    """What a person should know of the coordinates of what is written, in sentences.
+
+    Args:
+        twin: the twin.
+    """
+    notes = []
+    if axes_unknown(twin.config.body):
+        notes.append("The organ's files say no axes: they were taken as LPS.")
+    if twin.written_in.unit != "mm":
+        notes.append(f"Files are in {twin.written_in.unit}, which 3D Slicer would read as mm; nrrd, mrk.json, mrb: mm.")
+    return notes
+
+
 def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dict[str, Any]:
-    """What is known of a registered frame: SI units, on the axes of the twin's files.
+    """What is known of a registered frame: SI units, on the axes of what is written; the pose on those of the clouds.
 
     Args:
         twin: the twin.
         result: what was found.
         truth: true node positions, (n, 3), metres, on the inner axes; None where they are not known.
     """
-    place = twin.coordinates
+    place = twin.written_in
     turned = place.directions(np.eye(3))
     net, doubt = place.directions(result.net_force), result.net_force_deviation
     row: dict[str, Any] = {
@@ -125,7 +152,7 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "largest_displacement_m": float(np.linalg.norm(result.displacement, axis=1).max()),
         "model_doubt": result.doubt,
         "largest_correction_m": float(np.linalg.norm(result.correction, axis=1).max()),
-        "pose": place.motion(result.pose.matrix).tolist(),
+        "pose": twin.coordinates.motion(result.pose.matrix).tolist(),
         "points": result.points,
         "points_alike": result.alike,
         "outliers": result.outliers,
@@ -257,8 +284,8 @@ def remove_record(folder: Path) -> None:
     if not path.is_file():
         return
     try:
-        rows = json.loads(path.read_text())["frames"]
-        files = [name for row in rows for name in row.get("files", [])]
+        record = json.loads(path.read_text())
+        files = [name for row in record["frames"] for name in row.get("files", [])] + record.get("bundles", [])
     except (ValueError, KeyError, TypeError, AttributeError):
         files = []  # damaged, or written by something else: whatever lies there stays
     for name in (*files, SERIES, RECORD):

@@ -28,7 +28,7 @@ from .config import ConfigError
 from .export import WRITTEN, Exporter
 from .landmarks import MarkFiles, camera_from_landmarks, describe_landmarks
 from .record import NOTICE as NOTICE
-from .record import Recorder, counts, describe
+from .record import Recorder, counts, describe, notes_on
 from .twin import Camera, Frame, Twin, coordinates_of
 from .unknowns import priors_taken
 
@@ -295,6 +295,9 @@ class Scene:
             say(describe_landmarks(fit))
             pose = fit.pose
         with self.home.twin(**self.options) as twin:
+            say(f"results in {twin.written_in.unit}, {twin.written_in.axes.upper()}")
+            for note in notes_on(twin):
+                say(note)
             yield twin, "align" if start.align else camera_of(twin, pose)
 
 

@@ -61,6 +61,8 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
     options, place = record["options"], Coordinates(**record["files_in"])
     shown = _listed(rows)
     return {
+        "coordinates": _coordinates(record),
+        "notes": record.get("notes", []),
         "model": options["model"],
         "zone": options["zone"],
         "known": options.get("forces") == "known",
@@ -82,6 +84,16 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
         if len(rows) > 1
         else None,
     }
+
+
+def _coordinates(record: Mapping[str, Any]) -> str:
+    """Unit and axes of everything that a record holds, in words."""
+    files = record["files_in"]
+    figures, pose = record.get("figures_in", files), record.get("pose_in", files)  # older records have but one
+    return (
+        f"Files: {files['unit']}, {files['axes'].upper()}. Forces: newtons, {figures['axes'].upper()}. Lengths: "
+        f"metres in registration.json, millimetres here. Pose: metres, {pose['axes'].upper()}, as the clouds."
+    )
 
 
 def _otherwise(asked: Mapping[str, Any]) -> str:

@@ -171,6 +171,13 @@ class Twin:
         """Unit and axes of the files that the body was made from."""
         return coordinates_of(self.config)
 
+    @property
+    def written_in(self) -> Coordinates:
+        """Unit and axes of what is written of its registrations; figures are in metres, on the same axes."""
+        section, own = self.config.registration, self.coordinates
+        unit = own.unit if section.output_unit == "source" else section.output_unit
+        return Coordinates(unit, own.axes if section.frame == "source" else section.frame)
+
     def predict(self, forces: ArrayLike) -> State:
         """The state under nodal forces: `displacement`, (n, 3), metres, and its derivatives.
 

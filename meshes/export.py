@@ -1,4 +1,9 @@
-"""Surfaces and time series out: STL, PLY and VTP in the coordinates that the files came in, PVD for ParaView."""
+"""Surfaces and time series out: STL, PLY, OBJ and VTP that state their unit and axes, PVD for ParaView.
+
+3D Slicer takes the axes of a model from what its file states, and reads the numbers as millimetres: `SPACE=LPS` in the
+header of an STL, in a comment of a PLY, in the first comment of an OBJ, as a text in the field data of a VTP or VTU
+(Slicer, Libs/MRML/Core/vtkMRMLModelStorageNode.cxx: ReadDataInternal, WriteDataInternal). `UNIT=mm` beside it is ours.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +16,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike
-from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkPoints
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 from vtkmodules.vtkIOGeometry import vtkSTLWriter
@@ -19,10 +24,11 @@ from vtkmodules.vtkIOPLY import vtkPLYWriter
 from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
 from .body import Floats, Ints, Surface
-from .files import Axes, FileError, Unit
+from .files import Axes, FileError, Unit, add_words, discard, vtk_messages
 
-SURFACE_FORMATS = ("stl", "ply", "vtp")
+SURFACE_FORMATS = ("stl", "ply", "obj", "vtp")
 PER_METRE: Mapping[str, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+_MADE_BY = "softtwin output."
 _TURN: Mapping[str, Floats] = {"lps": np.ones(3), "ras": np.array([-1.0, -1.0, 1.0])}
 
 
@@ -41,6 +47,14 @@ class Coordinates:
     def __post_init__(self) -> None:
         if self.unit not in PER_METRE or self.axes not in _TURN:
             raise ValueError(f"Coordinates: expected m, cm or mm and lps or ras, got {self.unit!r} and {self.axes!r}.")
+
+    @property
+    def words(self) -> dict[str, str]:
+        """What a file in these coordinates states about itself: `SPACE`, as 3D Slicer reads it, and `UNIT`."""
+        return {"SPACE": self.axes.upper(), "UNIT": self.unit}
+
+    def __str__(self) -> str:
+        return " ".join(f"{name}={word}" for name, word in self.words.items())
 
     def lengths(self, vectors: ArrayLike) -> Floats:
         """Points or displacements in these coordinates, (..., 3), from metres and LPS."""
@@ -64,40 +78,53 @@ class Coordinates:
         return turn[:, None] * np.asarray(matrix, dtype=np.float64) * turn
 
 
-def write_surface(path: str | Path, surface: Surface, fields: Mapping[str, ArrayLike] | None = None) -> None:
+def write_surface(
+    path: str | Path,
+    surface: Surface,
+    fields: Mapping[str, ArrayLike] | None = None,
+    place: Coordinates | None = None,
+) -> None:
     """Write a triangle surface; the file appears whole or not at all.
 
     Vertices that no triangle uses are left out.
 
     Args:
-        path: file to write: `.stl` and `.ply` (binary, single precision) or `.vtp` (double precision).
+        path: file to write: `.stl` and `.ply` (binary, single precision), `.obj` (nine digits) or `.vtp` (double
+            precision).
         surface: the surface, in the coordinates that are to be written.
         fields: arrays with a row for each vertex, by name; VTP alone keeps them.
+        place: these coordinates, which the file then states; nothing is stated without.
 
     Raises:
         FileError: another suffix, or the file could not be written.
     """
     used, local = np.unique(surface.triangles, return_inverse=True)
     chosen = {name: np.asarray(field)[used] for name, field in (fields or {}).items()}
-    _write(Path(path), _polygons(surface.points[used], local.reshape(-1, 3), chosen))
+    _write(Path(path), _polygons(surface.points[used], local.reshape(-1, 3), chosen), place)
 
 
-def write_points(path: str | Path, points: ArrayLike, fields: Mapping[str, ArrayLike] | None = None) -> None:
-    """Write a cloud of points, (p, 3); otherwise as `write_surface`, of which STL knows no points.
+def write_points(
+    path: str | Path,
+    points: ArrayLike,
+    fields: Mapping[str, ArrayLike] | None = None,
+    place: Coordinates | None = None,
+) -> None:
+    """Write a cloud of points, (p, 3); otherwise as `write_surface`, of which STL and OBJ know no points.
 
     Args:
         path: file to write: `.ply` or `.vtp`.
         points: (p, 3), in the coordinates that are to be written.
         fields: arrays with a row for each point, by name; VTP alone keeps them.
+        place: these coordinates, which the file then states; nothing is stated without.
 
     Raises:
         FileError: another suffix, or the file could not be written.
     """
     positions = np.asarray(points, dtype=np.float64)
     path = Path(path)
-    if path.suffix.lower() == ".stl":
-        raise FileError(f"{path}: expected the suffix .ply or .vtp, got '.stl': it holds triangles alone.")
-    _write(path, _polygons(positions, np.arange(len(positions))[:, None], fields or {}))
+    if path.suffix.lower() in (".stl", ".obj"):
+        raise FileError(f"{path}: expected the suffix .ply or .vtp, got {path.suffix!r}: it holds triangles alone.")
+    _write(path, _polygons(positions, np.arange(len(positions))[:, None], fields or {}), place)
 
 
 def _polygons(points: Floats, cells: Ints, fields: Mapping[str, ArrayLike]) -> vtkPolyData:
@@ -119,34 +146,62 @@ def _polygons(points: Floats, cells: Ints, fields: Mapping[str, ArrayLike]) -> v
     return data
 
 
-def _write(path: Path, data: vtkPolyData) -> None:
+def _write(path: Path, data: vtkPolyData, place: Coordinates | None) -> None:
     suffix = path.suffix.lower()
-    writers: Mapping[str, Any] = {".stl": vtkSTLWriter, ".ply": vtkPLYWriter, ".vtp": vtkXMLPolyDataWriter}
-    if suffix not in writers:
-        raise FileError(f"{path}: expected the suffix {', '.join(writers)}, got {path.suffix!r}.")
+    if suffix not in (suffixes := [f".{name}" for name in SURFACE_FORMATS]):
+        raise FileError(f"{path}: expected the suffix {', '.join(suffixes)}, got {path.suffix!r}.")
     partial = path.with_name(f".partial.{path.name}")  # VTK's PLY writer adds a suffix to any name without its own
-    writer = writers[suffix]()
-    writer.SetFileName(str(partial))
-    if suffix == ".vtp":
-        writer.SetDataModeToAppended()
-        writer.EncodeAppendedDataOff()
-    else:
-        writer.SetFileTypeToBinary()
-        for name in [data.GetPointData().GetArrayName(i) for i in range(data.GetPointData().GetNumberOfArrays())]:
-            data.GetPointData().RemoveArray(name)
-    writer.SetInputData(data)
-    if not path.parent.is_dir() or not writer.Write() or not partial.is_file():
-        partial.unlink(missing_ok=True)
+    try:
+        written = path.parent.is_dir() and (_as_text if suffix == ".obj" else _by_vtk)(partial, data, place)
+    except OSError:
+        written = False
+    if not written or not partial.is_file():
+        discard(partial)
         raise FileError(f"{path}: could not be written; is the folder there, and is the disk full?")
     os.replace(partial, path)
 
 
-def write_series(path: str | Path, files: Iterable[tuple[float, str, str]]) -> None:
+def _by_vtk(path: Path, data: vtkPolyData, place: Coordinates | None) -> bool:
+    writers: Mapping[str, Any] = {".stl": vtkSTLWriter, ".ply": vtkPLYWriter, ".vtp": vtkXMLPolyDataWriter}
+    suffix = path.suffix.lower()
+    writer = writers[suffix]()
+    writer.SetFileName(str(path))
+    if suffix == ".vtp":
+        writer.SetDataModeToAppended()
+        writer.EncodeAppendedDataOff()
+        add_words(data, place.words if place else {})
+    else:
+        writer.SetFileTypeToBinary()
+        for name in [data.GetPointData().GetArrayName(i) for i in range(data.GetPointData().GetNumberOfArrays())]:
+            data.GetPointData().RemoveArray(name)
+    if place and suffix == ".stl":
+        writer.SetHeader(f"{_MADE_BY} {place}")
+    if place and suffix == ".ply":
+        for word in str(place).split():
+            writer.AddComment(word)
+    writer.SetInputData(data)
+    with vtk_messages():
+        return bool(writer.Write())
+
+
+def _as_text(path: Path, data: vtkPolyData, place: Coordinates | None) -> bool:
+    """An OBJ; VTK's own writer keeps six digits and has no place for a comment."""
+    points = vtk_to_numpy(data.GetPoints().GetData())
+    triangles = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).reshape(-1, 3) + 1
+    with path.open("w", encoding="ascii") as file:
+        file.write(f"# {_MADE_BY}{f' {place}' if place else ''}\n")
+        np.savetxt(file, points, "v %.9g %.9g %.9g")
+        np.savetxt(file, triangles, "f %d %d %d")
+    return True
+
+
+def write_series(path: str | Path, files: Iterable[tuple[float, str, str]], place: Coordinates | None = None) -> None:
     """Write a PVD that ParaView opens as a time series; the file appears whole or not at all.
 
     Args:
         path: file to write, `.pvd`.
         files: time, name of the part, and file (VTU or VTP, relative to the PVD) of each piece.
+        place: coordinates of these files, which the series then states; nothing is stated without.
     """
     path = Path(path)
     pieces = list(files)
@@ -156,7 +211,9 @@ def write_series(path: str | Path, files: Iterable[tuple[float, str, str]]) -> N
         f"file={quoteattr(file)}/>"
         for time, name, file in pieces
     ]
-    head = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">']
+    said = [f"<!-- {_MADE_BY} {place} -->"] if place else []
+    head = ['<?xml version="1.0"?>', *said, '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">']
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_text("\n".join([*head, "  <Collection>", *lines, "  </Collection>", "</VTKFile>", ""]))
+    text = "\n".join([*head, "  <Collection>", *lines, "  </Collection>", "</VTKFile>", ""])
+    partial.write_text(text, encoding="utf-8")
     os.replace(partial, path)

@@ -18,7 +18,7 @@ import meshio
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
-from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkPoints, vtkStringOutputWindow
+from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkPoints, vtkStringArray, vtkStringOutputWindow
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
 from vtkmodules.vtkFiltersCore import vtkTriangleFilter
 from vtkmodules.vtkIOLegacy import vtkDataSetReader
@@ -94,61 +94,92 @@ def in_metres(lengths: ArrayLike, unit: Unit) -> Floats:
 
 
 def stated_axes(path: str | Path) -> Axes | None:
-    """The axes that a file states about itself, as 3D Slicer writes it (`SPACE=RAS` in its comment); None for none.
+    """The axes that a file states about itself, as 3D Slicer writes and reads them; None for none.
+
+    `SPACE=LPS` or `SPACE=RAS` in the head of STL, PLY, OBJ and VTK; a text `SPACE` in the field data of VTP and VTU
+    (Slicer, Libs/MRML/Core/vtkMRMLModelStorageNode.cxx, WriteDataInternal and GetCoordinateSystemFromFieldData).
 
     Args:
         path: any file.
 
     Raises:
-        FileError: missing or empty file.
+        FileError: missing, empty or damaged file.
     """
-    found = re.search(rb"SPACE=(LPS|RAS)\b", _existing(path).read_bytes()[:_HEAD])
-    return found.group(1).decode().lower() if found else None  # type: ignore[return-value]
+    word = _stated(_existing(path), "SPACE").lower()
+    return word if word in AXES else None  # type: ignore[return-value]
 
 
-def read_mesh(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Surface | tuple[Floats, Ints]:
+def stated_unit(path: str | Path) -> Unit | None:
+    """The unit of length that a file states about itself, as softtwin writes it (`UNIT=mm`); None for none.
+
+    Args:
+        path: any file.
+
+    Raises:
+        FileError: missing, empty or damaged file.
+    """
+    word = _stated(_existing(path), "UNIT")
+    return word if word in UNITS else None  # type: ignore[return-value]
+
+
+def _stated(path: Path, name: str) -> str:
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if path.suffix.lower() not in (".vtp", ".vtu"):
+        found = re.search(rb"\b%s=(\w+)" % name.encode(), head)
+        return found.group(1).decode("latin-1") if found else ""
+    if f'Name="{name}"'.encode() not in head:  # field data stand first, and the whole file need not be read
+        return ""
+    array = _read_vtk(path).GetFieldData().GetAbstractArray(name)
+    return str(array.GetValue(0)) if array and array.IsA("vtkStringArray") and array.GetNumberOfValues() else ""
+
+
+def read_mesh(path: str | Path, unit: Unit | None = None, axes: Axes | None = None) -> Surface | tuple[Floats, Ints]:
     """What a mesh file holds: points and cells where it has tetrahedra or hexahedra, else a surface.
 
     Args:
         path: STL, PLY, OBJ, VTK, VTU, VTP or MSH file.
-        unit: the file's unit of length.
-        axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign).
+        unit: the file's unit of length; what the file states if not given, else metres.
+        axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign); what the file states if not
+            given, else LPS.
 
     Raises:
         FileError: as `read_surface`.
     """
     mesh = _read(path)
     if {"tetra", "hexahedron"} & set(mesh.cells):
-        return _volume(Path(path), mesh, unit, axes)
-    return _surface(Path(path), mesh, unit, axes)
+        return _volume(Path(path), mesh, *_known(path, unit, axes))
+    return _surface(Path(path), mesh, *_known(path, unit, axes))
 
 
-def read_surface(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> Surface:
+def read_surface(path: str | Path, unit: Unit | None = None, axes: Axes | None = None) -> Surface:
     """The triangles of a file as a surface in metres; quadrilaterals are split, vertices at one place merged.
 
     Args:
         path: STL, PLY, OBJ, VTK, VTU, VTP or MSH file.
-        unit: the file's unit of length.
-        axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign).
+        unit: the file's unit of length; what the file states if not given, else metres.
+        axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign); what the file states if not
+            given, else LPS.
 
     Raises:
         FileError: missing, empty, damaged or unknown file, or no triangles in it.
     """
-    return _surface(Path(path), _read(path), unit, axes)
+    return _surface(Path(path), _read(path), *_known(path, unit, axes))
 
 
-def read_volume(path: str | Path, unit: Unit = "m", axes: Axes = "lps") -> tuple[Floats, Ints]:
+def read_volume(path: str | Path, unit: Unit | None = None, axes: Axes | None = None) -> tuple[Floats, Ints]:
     """Points (n, 3) in metres and cells (m, 4) or (m, 8) of a volume mesh, the file's node numbers kept.
 
     Args:
         path: VTK, VTU or MSH file with tetrahedra or hexahedra (not both); triangles beside them are ignored.
-        unit: the file's unit of length.
-        axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign).
+        unit: the file's unit of length; what the file states if not given, else metres.
+        axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign); what the file states if not
+            given, else LPS.
 
     Raises:
         FileError: missing, empty, damaged or unknown file, a surface only, or both kinds of cells.
     """
-    return _volume(Path(path), _read(path), unit, axes)
+    return _volume(Path(path), _read(path), *_known(path, unit, axes))
 
 
 def read_cloud(path: str | Path, unit: Unit = "m", axes: Axes = "lps", normals: bool = False) -> Floats:
@@ -225,7 +256,7 @@ def write_body(path: str | Path, body: Body, fields: Mapping[str, ArrayLike] | N
     Raises:
         FileError: another suffix, or the file could not be written.
     """
-    grid = _grid(body.points, body.cells)
+    grid = unstructured_grid(body.points, body.cells)
     for name, field in (fields or {}).items():
         array = np.asarray(field)
         _add(grid.GetPointData() if len(array) == len(body.points) else grid.GetFieldData(), f"{_FIELD}{name}", array)
@@ -295,7 +326,11 @@ def read_fields(path: str | Path) -> dict[str, NDArray[Any]]:
 
 
 def write_deformed(
-    path: str | Path, body: Body, displacement: ArrayLike, fields: Mapping[str, ArrayLike] | None = None
+    path: str | Path,
+    body: Body,
+    displacement: ArrayLike,
+    fields: Mapping[str, ArrayLike] | None = None,
+    words: Mapping[str, str] | None = None,
 ) -> None:
     """Write the deformed body with its displacement and other fields to a VTU file for ParaView.
 
@@ -304,6 +339,7 @@ def write_deformed(
         body: the body at rest.
         displacement: nodal displacements, (n, 3), metres.
         fields: further fields by name, one row a node, or one row a cell.
+        words: what the file states about itself, as text in its field data (see `Coordinates.words`).
 
     Raises:
         FileError: another suffix, or the file could not be written.
@@ -312,7 +348,7 @@ def write_deformed(
     moved = np.asarray(displacement, dtype=np.float64)
     if moved.shape != body.points.shape:
         raise ValueError(f"displacement: expected shape {body.points.shape}, got {moved.shape}.")
-    grid = _grid(body.points + moved, body.cells)
+    grid = unstructured_grid(body.points + moved, body.cells)
     if body.dimension == 2:
         moved = np.column_stack([moved, np.zeros(len(moved))])
     _add(grid.GetPointData(), "displacement", moved)
@@ -322,7 +358,36 @@ def write_deformed(
             raise ValueError(f"fields[{name!r}]: expected a row for each of {len(body.points)} nodes or "
                              f"{len(body.cells)} cells, got shape {array.shape}.")  # fmt: skip
         _add(grid.GetPointData() if len(array) == len(body.points) else grid.GetCellData(), name, array)
+    add_words(grid, words or {})
     _write(Path(path), grid)
+
+
+def add_words(data: Any, words: Mapping[str, str]) -> None:
+    """Texts in the field data of a VTK data set, where 3D Slicer looks for the axes.
+
+    Args:
+        data: the data set.
+        words: texts by name.
+    """
+    for name, word in words.items():
+        array = vtkStringArray()
+        array.SetName(name)
+        array.InsertNextValue(word)
+        data.GetFieldData().AddArray(array)
+
+
+def _known(path: str | Path, unit: Unit | None, axes: Axes | None) -> tuple[Unit, Axes]:
+    return unit or stated_unit(path) or "m", axes or stated_axes(path) or "lps"
+
+
+def discard(partial: Path) -> None:
+    """Remove what was written of a file that could not be finished.
+
+    Args:
+        partial: it; it may not be there, nor its folder.
+    """
+    with contextlib.suppress(OSError):
+        partial.unlink()
 
 
 def _existing(path: str | Path) -> Path:
@@ -429,7 +494,8 @@ def _from_meshio(path: Path) -> _Mesh:
 
 
 @contextlib.contextmanager
-def _vtk_messages() -> Iterator[vtkStringOutputWindow]:
+def vtk_messages() -> Iterator[vtkStringOutputWindow]:
+    """What VTK says meanwhile, which it would print."""
     window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
     loudness = vtkLogger.GetCurrentVerbosityCutoff()
     vtkOutputWindow.SetInstance(window)
@@ -444,7 +510,7 @@ def _vtk_messages() -> Iterator[vtkStringOutputWindow]:
 def _read_vtk(path: Path) -> Any:
     reader = _VTK[path.suffix.lower()]()
     reader.SetFileName(str(path))
-    with _vtk_messages() as window:
+    with vtk_messages() as window:
         reader.Update()
         data = reader.GetOutput()
         said = " ".join(window.GetOutput().split())
@@ -600,7 +666,13 @@ def _warn_size(path: Path, size: float, unit: Unit, smallest: float) -> None:
     )
 
 
-def _grid(points: Floats, cells: Ints) -> vtkUnstructuredGrid:
+def unstructured_grid(points: Floats, cells: Ints) -> vtkUnstructuredGrid:
+    """Cells of one kind for VTK.
+
+    Args:
+        points: (n, 3), or (n, 2) in the plane.
+        cells: node numbers, as of a body.
+    """
     grid, nodes, array = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
     kind = KINDS[points.shape[1], cells.shape[1]]
     if points.shape[1] == 2:
@@ -634,10 +706,10 @@ def _write(path: Path, grid: vtkUnstructuredGrid) -> None:
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()
     writer.EncodeAppendedDataOff()
-    with _vtk_messages() as window:
+    with vtk_messages() as window:
         written = writer.Write()
         said = " ".join(window.GetOutput().split())
     if not written or said:
-        partial.unlink(missing_ok=True)
+        discard(partial)
         raise FileError(f"{path}: could not be written; is the folder there, and is the disk full? ({said[:200]}).")
     os.replace(partial, path)

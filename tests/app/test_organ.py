@@ -13,11 +13,12 @@ import pytest
 pytest.importorskip("pytetwild", reason="the extra mesh is absent")
 
 from softtwin.app import organ as module
-from softtwin.app.cli import _with_axes, main
+from softtwin.app.cli import _stated_unit, _with_axes, main
 from softtwin.app.config import BodySection, ConfigError, files_axes, parse_config
 from softtwin.app.organ import make_organ
 from softtwin.meshes.attachment import RegionError
-from softtwin.meshes.body import Body, BodyError
+from softtwin.meshes.body import Body, BodyError, Surface
+from softtwin.meshes.export import Coordinates, write_surface
 from softtwin.meshes.files import FileError, UnitWarning
 from softtwin.meshes.shapes import beam, liver_phantom
 
@@ -169,6 +170,24 @@ def test_a_source_that_states_ras_must_be_recorded(files: Path, tmp_path: Path, 
     with pytest.raises(ConfigError, match=r"states that it is in RAS, .* write source = \".*organ\.ply:ras\""):
         make(files, source=str(path))
     assert _with_axes(str(path)) == f"{path}:ras"  # what `softtwin build` writes
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "obj", "vtp"])
+def test_a_unit_that_a_file_states_is_taken_and_none_against_it(
+    files: Path, tmp_path: Path, phantom: Body, kind
+) -> None:
+    path, place = tmp_path / f"organ.{kind}", Coordinates("mm", "ras")
+    write_surface(path, Surface(place.lengths(phantom.points), phantom.boundary), place=place)
+    assert _stated_unit(path) == _stated_unit(Path(f"{path}:ras")) == "mm"  # what `softtwin build` takes
+    assert _stated_unit(tmp_path / "yet to be written.stl") is None and _stated_unit(files / "organ.stl") is None
+    with pytest.raises(ConfigError, match=r'body\.unit: .* states that it is in mm, got \'m\'; write unit = "mm"'):
+        make(files, source=f"{path}:ras", unit="m")
+    inner = tmp_path / f"tumour.{kind}"
+    write_surface(
+        inner, Surface(place.lengths(phantom.inner["tumour"].points), phantom.inner["tumour"].triangles), place=place
+    )
+    made = make(files, source=str(files / "organ.vtu"), frame="lps", inner={"tumour": str(inner)})
+    assert np.abs(made.inner["tumour"].points.mean(0) - phantom.inner["tumour"].points.mean(0)).max() < 1e-3
 
 
 def test_an_inner_surface_outside_the_organ_is_refused_and_a_part_outside_is_said(files: Path, tmp_path: Path) -> None:

@@ -281,7 +281,8 @@ def test_figures_are_on_the_axes_of_the_twins_files(plain_twin: Twin, cloud, for
     known = Pose.identity().moved(np.array([0.0, 0.02, 0.1, 0.01, 0.0, 0.0]), np.zeros(3))
     seen = known.apply(cloud)
     plain = register_clouds(plain_twin, [seen], tmp_path / "lps", camera=known, say=lambda line: None)[0]
-    twin = Turned(plain_twin.model, plain_twin.config)
+    section = {"zone": "tip", "frame": "source", "output_unit": "source"}
+    twin = Turned(plain_twin.model, Config.model_validate({"registration": section}))
     turned = register_clouds(twin, [seen], tmp_path / "ras", camera=known, say=lambda line: None)[0]
     flip = np.array([-1.0, -1.0, 1.0])
     np.testing.assert_allclose(turned["net_force_N"], flip * plain["net_force_N"], rtol=1e-12)
@@ -337,6 +338,10 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
         "landmark_deviation": 1e-3,
         "penalty": "amplitude",
         "alpha": 0.2,
+        "frame": "ras",
+        "output_unit": "m",
+        "voxel": 0.01,
+        "target_points": 2,
     }
     flags = [word for name, value in wanted.items() for word in (f"--{name.replace('_', '-')}", value)]
     register(capsys, mesh_folder, mesh_cloud, *flags, "--noise-known", "--format", "ply", "--format", "stl")
@@ -376,7 +381,7 @@ def test_strict_ends_with_code_3(capsys, mesh_folder: Path, mesh_cloud: Path) ->
     ("words", "message"),
     [
         (("--zone", "nowhere"), "registration.zone: expected one of"),
-        (("--format", "xyz"), "--format: expected vtu, stl, ply, vtp, got xyz"),
+        (("--format", "xyz"), "--format: expected vtu, stl, ply, obj, vtp, nrrd, mrk.json, seq.mrb, got xyz"),
         (("--noise", "-1"), "registration.noise"),
         (("--pose", "unknown", "--pose-turn", "0"), "registration.pose_turn: Input should be greater than 0"),
         (("--pose", "unknown", "--pose-shift", "0"), "registration.pose_shift: Input should be greater than 0"),

@@ -23,6 +23,7 @@ from softtwin.app.sequences import find_registrations
 from softtwin.app.twin import Frame, Twin
 from softtwin.app.workspace import Workspace
 from softtwin.meshes.body import Body, Surface
+from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import LinearResponse, create, write_block
@@ -153,9 +154,9 @@ class Still:
         self.body = body
 
 
-def make_registration(folder: Path, body: Body, frames: int = 4) -> None:
+def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[str, Any] | None = None) -> None:
     """Frames as `softtwin register` writes them: all good but the second, which is refused, and a cloud without use."""
-    twin = Twin(Still(body), Config.model_validate({"body": {"unit": "mm"}}))  # type: ignore[arg-type]
+    twin = Twin(Still(body), Config.model_validate(entries or {"body": {"unit": "mm"}}))  # type: ignore[arg-type]
     shapes = bends(body, frames)
     bounds = iter([(2e-4, ()), (3e-4, ()), (4e-4, ("it lies 3 times as far out",)), (5e-4, ())])
 
@@ -270,6 +271,18 @@ def test_figures_are_those_of_the_files(page: Page) -> None:
     assert "50 s" in text  # all stages together
 
 
+def test_frames_are_drawn_where_they_lie_whatever_they_were_written_in(tmp_path: Path, body: Body) -> None:
+    """Their files are in metres and RAS, of an organ that nobody has said the axes of."""
+    written = {"frame": "ras", "output_unit": "m"}
+    make_registration(tmp_path, body, 2, {"body": {"source": "liver.stl", "unit": "mm"}, "registration": written})
+    found = sequences.sequence_section(tmp_path, body, Studio("no pictures"))
+    assert found["coordinates"].startswith("Files: m, RAS. Forces: newtons, RAS.")
+    assert any("taken as LPS" in note for note in found["notes"])
+    place = Coordinates(**json.loads((tmp_path / "registration.json").read_text())["files_in"])
+    drawn = sequences._displacement(tmp_path / "frame_0000.vtu", body, place)
+    np.testing.assert_allclose(drawn, bends(body, 2)[0], atol=1e-12)
+
+
 def test_target_errors_before_and_after(full: Workspace, body: Body) -> None:
     section = report.registration_section(full, Studio("no pictures"))
     before, surrogate, reference = (row["targets"]["tumour"] for row in section["rows"])
@@ -292,6 +305,7 @@ def test_median_and_worst_sample_are_chosen(full: Workspace) -> None:
 def test_the_users_own_registrations_are_shown(page: Page) -> None:
     text = " ".join(page.text.split())
     assert "5 frames with the surrogate, forces on all loaded nodes: 3 accepted, 2 refused." in text
+    assert "Files: mm, LPS. Forces: newtons, LPS." in text and "Pose: metres, LPS, as the clouds." in text
     assert "Worst frame (1): refused, too <far>." in text
     assert "empty.ply" in text and "an empty cloud." in text
     assert "Young's modulus 4000 Pa (3900 to 12345), not told by the cloud" in text
