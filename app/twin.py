@@ -334,10 +334,14 @@ class Twin:
         """
         return {name: surface.points for name, surface in self._inner(result).items()}
 
+    @property
+    def organ(self) -> str:
+        """Name of the organ's own surface among those of the structures."""
+        return "organ" if "organ" not in self.body.inner else "organ surface"
+
     def surfaces(self, result: Registration) -> dict[str, Surface]:
         """The moved surface of each structure, metres, by name: the organ's first, then the inner ones."""
-        name = "organ" if "organ" not in self.body.inner else "organ surface"
-        return {name: outer(self.body).moved(result.displacement), **self._inner(result)}
+        return {self.organ: outer(self.body).moved(result.displacement), **self._inner(result)}
 
     def _inner(self, result: Registration) -> dict[str, Surface]:
         return {
