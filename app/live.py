@@ -41,6 +41,10 @@ class Answer:
     is_late: bool
 
 
+Reply = Callable[[Answer, Mapping[str, Any]], None]
+"""What is given each answer, and its figures as they stand in the record."""
+
+
 def answers(
     sequence: Sequence,
     box: Mailbox,
@@ -80,7 +84,7 @@ def register_live(
     formats: tuple[str, ...] = WRITTEN,
     budget: float | None = None,
     marks: MarkFiles | None = None,
-    reply: Callable[[Answer], None] | None = None,
+    reply: Reply | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
     """Register what comes into a mailbox and write each frame as it is found; returns the figures of all frames.
@@ -94,7 +98,7 @@ def register_live(
         formats: of the files of each frame; none are written for `()`, which is the quickest.
         budget: as for `answers`.
         marks: landmarks that pull beside clouds in files.
-        reply: is given each answer before its files are written.
+        reply: is given each answer and its figures before files are written.
         say: prints one line a frame.
 
     Raises:
@@ -106,10 +110,12 @@ def register_live(
         marks.check(twin)
     with Recorder(Exporter(twin, output, formats), zone) as recorder:
         for answer in answers(sequence, box, budget, marks=marks):
-            if reply is not None:
-                reply(answer)
             figures = {"age_s": answer.age, "dropped": answer.dropped, "is_late": answer.is_late}
-            say(describe(recorder.add(answer.frame, answer.cloud, **figures)))
+            row = recorder.figures(answer.frame, answer.cloud, **figures)
+            if reply is not None:
+                reply(answer, row)
+            recorder.enter(row, answer.frame)
+            say(describe(row))
     check_any(recorder.rows)
     return recorder.rows
 

@@ -187,12 +187,15 @@ class Speaker:
         """The device of each structure."""
         return device_names([self.twin.organ, *self.twin.body.inner])
 
-    def messages(self, answer: Answer, counts: Mapping[str, int] | None = None) -> list[bytes]:
+    def messages(
+        self, answer: Answer, counts: Mapping[str, int] | None = None, row: Mapping[str, Any] | None = None
+    ) -> list[bytes]:
         """The messages of one answer, in the order in which they are sent.
 
         Args:
             answer: the answer.
             counts: what happened on the network, for the figures.
+            row: its figures in the record, where they are at hand: margins are not worked out twice.
         """
         found, said = answer.frame.registration, []
         usable = found is not None and answer.frame.judgement.is_usable
@@ -201,46 +204,43 @@ class Speaker:
             said.append(TransformMessage(self._pose(found), device_name=POSE))
         else:
             said += [PolyDataMessage(points=np.empty((0, 3)), device_name=name) for name in self.names.values()]
-        said.append(StringMessage(self._figures(answer, counts or {}), device_name=FIGURES))
+        said.append(StringMessage(self._figures(answer, counts or {}, row), device_name=FIGURES))
         return [_packed(message) for message in said]
 
     def _surface(self, name: str, surface: Surface) -> MessageBase:
-        return PolyDataMessage(
-            points=self.place.lengths(surface.points),
-            polygons=self._polygons(name, surface),
-            device_name=self.names[name],
-        )
+        """Vertices that no triangle uses (a volume's inner nodes) are left out; triangles stay from frame to frame."""
+        if name not in self._cells:
+            used, local = np.unique(surface.triangles, return_inverse=True)
+            self._cells[name] = used, np.insert(local.reshape(-1, 3), 0, 3, axis=1).ravel()
+        used, polygons = self._cells[name]
+        points = self.place.lengths(surface.points[used])
+        return PolyDataMessage(points=points, polygons=polygons, device_name=self.names[name])
 
     @cached_property
-    def _cells(self) -> dict[str, Any]:
+    def _cells(self) -> dict[str, tuple[Ints, Ints]]:
         return {}
-
-    def _polygons(self, name: str, surface: Surface) -> Any:
-        """The triangles as the message has them; they stay as they are from frame to frame."""
-        if name not in self._cells:
-            self._cells[name] = np.insert(surface.triangles, 0, 3, axis=1).ravel()
-        return self._cells[name]
 
     def _pose(self, found: Registration) -> Floats:
         matrix = self.place.motion(found.pose.matrix)
         matrix[:3, 3] = self.place.distances(matrix[:3, 3])
         return matrix
 
-    def _figures(self, answer: Answer, counts: Mapping[str, int]) -> str:
-        figures = {"notice": NOTICE, **figures_of(self.twin, answer, self.place), "network": dict(counts)}
+    def _figures(self, answer: Answer, counts: Mapping[str, int], row: Mapping[str, Any] | None) -> str:
+        figures = {"notice": NOTICE, **figures_of(self.twin, answer, self.place, row), "network": dict(counts)}
         text = json.dumps(finite(figures))  # ASCII, which is all that pyigtl packs without an error
         if len(text) > _LONGEST:
             text = json.dumps(finite({**figures, "margin95_mm": {}, "reasons": figures["reasons"][:1]}))
         return text
 
 
-def figures_of(twin: Twin, answer: Answer, place: Coordinates) -> dict[str, Any]:
+def figures_of(twin: Twin, answer: Answer, place: Coordinates, row: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """What an answer says beside its surfaces: verdict, reasons, net force, margins, how it kept up.
 
     Args:
         twin: the twin.
         answer: the answer.
         place: unit and axes of the network, which the net force is on, too.
+        row: as for `Speaker.messages`.
     """
     frame, found = answer.frame, answer.frame.registration
     figures: dict[str, Any] = {
@@ -257,14 +257,16 @@ def figures_of(twin: Twin, answer: Answer, place: Coordinates) -> dict[str, Any]
     }
     if found is None:
         return figures
-    margins = {twin.organ: found.uncertainty.margin()} | {
-        name: found.uncertainty.margin(points) for name, points in twin.embeddings.items()
-    }
+    margins = {twin.organ: float(found.uncertainty.margin().max())}
+    if row is None:
+        margins |= {name: float(found.uncertainty.margin(at).max()) for name, at in twin.embeddings.items()}
+    else:
+        margins |= {name: target["margin95_m"] for name, target in row["targets"].items()}
     return figures | {
         "net_force_N": place.directions(found.net_force).tolist(),
         "net_force_deviation_N": found.net_force_deviation.tolist(),
         "rms_distance_mm": 1e3 * found.rms_distance,
-        "margin95_mm": {name: 1e3 * float(margin.max()) for name, margin in margins.items()},
+        "margin95_mm": {name: 1e3 * margin for name, margin in margins.items()},
     }
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import ipaddress
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, urlsplit
 
 from .config import ConfigError
@@ -17,7 +17,7 @@ from .streams import Mailbox, WatchedFolder, fed
 from .twin import Twin
 
 if TYPE_CHECKING:
-    from .live import Answer
+    from .live import Answer, Reply
 
 SCHEME = "igtl"
 PORT = 18944  # that OpenIGTLink programs take where nothing is said
@@ -118,7 +118,7 @@ class Feed:
     """
 
     box: Mailbox
-    reply: Callable[[Answer], None] | None = None
+    reply: Reply | None = None
     told: Callable[[], str] = lambda: ""
 
 
@@ -157,9 +157,9 @@ def opened(
     box, speaker = Mailbox(), Speaker(twin, scene.outside)
     with Link(source, box, scene.outside, ours=list(speaker.names.values()), idle=idle, say=say) as link:
 
-        def reply(answer: Answer) -> None:
+        def reply(answer: Answer, row: Mapping[str, Any]) -> None:
             if link.peers:
-                link.send(speaker.messages(answer, link.counts))
+                link.send(speaker.messages(answer, link.counts, row))
 
         def told() -> str:
             return "OpenIGTLink: " + ", ".join(f"{count} {name}" for name, count in link.counts.items())
