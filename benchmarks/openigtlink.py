@@ -4,7 +4,7 @@
 
 The second process sends the next cloud when it has read the whole answer and checked every checksum of it. `network`
 answers each cloud with one registration that was found before, packed anew each time as the live loop does: that is
-what the network costs. With --twin, `registered` has each cloud registered by that twin's surrogate.
+what the network costs. With --twin, `registered` is the live loop itself on that twin, its record included.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from pyigtl.messages import CRC64, PointMessage
 from record import write
 from threadpoolctl import threadpool_limits
 
-from softtwin.app.live import Answer, answers
+from softtwin.app.live import Answer, register_live
 from softtwin.app.messages import FIGURES, HEADER_SIZE, Header, Speaker, cloud_message
 from softtwin.app.openigtlink import Link
 from softtwin.app.sources import Address
@@ -83,9 +84,13 @@ def measured(twin: Twin, cloud: Floats, kind: str, rounds: int, registers: bool,
         with subprocess.Popen([*command, "--rounds", str(rounds)], stdout=subprocess.PIPE, text=True) as peer:
             begin = time.process_time()
             if registers:
-                stream = answers(sequence, box)
-                for _ in range(WARM + rounds):
-                    link.send(speaker.messages(next(stream), link.counts))
+
+                def reply(answer: Answer, row: Mapping[str, Any]) -> None:
+                    link.send(speaker.messages(answer, link.counts, row))
+                    if answer.frame.number == WARM + rounds - 1:
+                        box.close()
+
+                register_live(twin, box, folder / "live", formats=(), reply=reply, say=lambda line: None)
             else:
                 for _ in range(WARM + rounds):
                     arrival = box.take()

@@ -23,6 +23,7 @@ from softtwin.app.config import ConfigError
 from softtwin.app.live import Answer, register_live
 from softtwin.app.messages import FIGURES, POSE, Header, MessageError, Speaker, cloud_in, cloud_message, device_names
 from softtwin.app.openigtlink import LIMIT, Link, LinkError
+from softtwin.app.register import Scene
 from softtwin.app.sources import Address, parse_source
 from softtwin.app.streams import Arrival, Mailbox
 from softtwin.app.twin import Sequence, Twin
@@ -301,10 +302,11 @@ def header(kind: str = "POINT", size: int = 0, version: int = 1) -> str:
     ).hex()  # fmt: skip
 
 
+REQUEST = b"GET / HTTP/1.1\r\nHost: localhost:18944\r\nAccept: everything\r\n\r\n"
 BROKEN = {
     "a gigabyte announced": (header(size=GIGABYTE), f"POINT of {GIGABYTE} bytes announced, more than {LIMIT}"),
     "more than there are numbers for": (header(size=2**64 - 1), "bytes announced"),
-    "another protocol": (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nAccept: text/plain\r\n\r\n".hex(), "expected a header"),
+    "another protocol": (REQUEST.hex(), "expected a header"),
     "zeros": ("00" * 58, "expected a header"),
     "a version of the future": (header(version=900), "expected a header"),
 }  # fmt: skip
@@ -479,6 +481,11 @@ def test_pyigtl_itself_understands_us(plain_twin: Twin, cloud: np.ndarray, role:
 
 
 # ---------------------------------------------------------------------- words
+
+
+def test_axes_of_the_clouds(mesh_folder: Path) -> None:
+    assert Scene.of(mesh_folder, {}, None).outside == Coordinates("m", "lps")
+    assert Scene.of(mesh_folder, {}, "mm", "ras").outside == Coordinates("mm", "ras")
 
 
 def test_sources() -> None:
