@@ -194,7 +194,7 @@ class Link:
         place: unit and axes of the network.
         ours: names of our own devices: what a peer sends back under them is no cloud.
         limit: most bytes of a body; more drops the connection.
-        idle: seconds without a cloud after which the link closes; never if not given.
+        idle: seconds without a cloud or an answer after which the link closes; never if not given.
         say: prints a line, from any thread.
         clock: seconds of a monotonic clock.
 
@@ -256,6 +256,7 @@ class Link:
         Args:
             messages: whole ones, sent one after the other.
         """
+        self._last = self._clock()  # a peer may wait for it before it sends again
         with self._lock:
             for peer in self._peers:
                 peer.outbox.put(messages)

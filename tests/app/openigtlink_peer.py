@@ -13,6 +13,7 @@ import sys
 import time
 from typing import Any
 
+PATIENCE = 100.0  # seconds after which whoever waits has waited in vain
 TABLE = []
 for byte in range(256):
     rest = byte << 56
@@ -96,9 +97,10 @@ class Peer:
 
     def accept(self) -> None:
         self.connection, _ = self.listener.accept()
+        self.connection.settimeout(PATIENCE)
 
     def connect(self, port: int) -> None:
-        self.connection = socket.create_connection(("127.0.0.1", port))
+        self.connection = socket.create_connection(("127.0.0.1", port), PATIENCE)
 
     def close(self, all: bool = False) -> None:
         self.connection.close()
