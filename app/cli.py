@@ -15,7 +15,7 @@ import click
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.attachment import File, parse_file, parse_regions
-from softtwin.meshes.files import Unit, stated_axes, stated_unit
+from softtwin.meshes.files import Axes, Unit, stated_axes, stated_unit
 from softtwin.reference.ranks import FailedElsewhere
 
 from .config import LAWS, Config, ConfigError, parse_config, to_toml
@@ -230,6 +230,12 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
 )
 @click.option("--zone", help="Node set whose nodes may carry force; '' for all loaded nodes.")
 @click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
+@click.option(
+    "--frame",
+    "axes",
+    type=click.Choice(["lps", "ras"], case_sensitive=False),
+    help="Axes of the clouds; the organ's if not given.",
+)
 @click.option("--noise", type=float, help="Noise of a point, metres, that the search for it begins with.")
 @click.option("--noise-known", is_flag=True, default=None, help="Hold the noise at --noise instead of finding it.")
 @click.option(
@@ -286,13 +292,18 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
     help="vtu: the organ; stl, ply, obj, vtp: surfaces; nrrd: displacement field; mrk.json: targets; seq.mrb: "
     "sequences (may be repeated).  [vtu, vtp]",
 )
-@click.option("--frame", type=click.Choice(["lps", "ras", "source"]), help="Axes of the results.  [lps]")
+@click.option("--output-frame", type=click.Choice(["lps", "ras", "source"]), help="Axes of the results.  [lps]")
 @click.option("--output-unit", type=click.Choice(["mm", "m", "source"]), help="Unit of the results' files.  [mm]")
 @click.option("--voxel", type=float, help="Edge of a voxel of the displacement field, metres; 0: 64 along the organ.")
 @click.option("--target-points", type=int, help="Points of each inner surface in mrk.json, beside its centre.")
 @click.option("--truth", type=_EXISTING, help="True node positions in .npy, metres, (frames, n, 3), to state errors.")
 @click.option("--budget", type=float, help="Seconds for a frame, after which the best so far is taken.")
-@click.option("--watch", is_flag=True, help="CLOUDS is a folder that is written to: register the newest, until Ctrl-C.")
+@click.option(
+    "--watch",
+    is_flag=True,
+    help="CLOUDS is a folder that is written to, or a place of OpenIGTLink (igtl://HOST:PORT, igtl://:PORT to listen; "
+    "mm and RAS if not given): register the newest, until Ctrl-C.",
+)
 @click.option("--idle", type=float, help="With --watch: end after so many seconds without a new cloud.")
 @click.option("--strict", is_flag=True, help="End with code 3 unless every frame is accepted.")
 @click.option("--output", type=_PATH, default=Path("registration"), show_default=True, help="Folder of the results.")
@@ -300,6 +311,7 @@ def register(
     twin: Path,
     clouds: tuple[str, ...],
     unit: Unit | None,
+    axes: Axes | None,
     matrix: Path | None,
     landmarks: tuple[Path, Path] | None,
     align: str | None,
@@ -317,13 +329,16 @@ def register(
 
     Every frame has a verdict: accepted, doubtful or refused, with reasons. Written to the folder: registration.json,
     and for each frame the organ with displacement and force (VTU) and the moved surface of each structure, in
-    millimetres and LPS (--output-unit, --frame); frames.pvd opens all of it in ParaView, and with --format seq.mrb
-    frames.mrb in 3D Slicer. Clouds are read in the unit and on the axes of the organ's files (--unit).
+    millimetres and LPS (--output-unit, --output-frame); frames.pvd opens all of it in ParaView, and with --format seq.mrb
+    frames.mrb in 3D Slicer. Clouds are read in the unit and on the axes of the organ's files (--unit, --frame).
+
+    A peer of OpenIGTLink gets each answer back: a POLYDATA for every structure, the TRANSFORM pose, the STRING figures.
 
     TWIN is a twin's folder; with --model reference a folder with a body and its configuration is enough.
     """
     from .export import FORMATS
     from .register import Start, register_files
+    from .sources import SCHEME, parse_source
 
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
@@ -334,19 +349,21 @@ def register(
     start = Start(matrix, landmarks or None, align is not None, marks or None)
     if idle is not None and not watch:
         raise ConfigError("--idle: expected --watch beside it.")
+    if not watch and any(name.startswith(f"{SCHEME}://") for name in clouds):
+        raise ConfigError(f"CLOUDS: expected --watch beside a place of OpenIGTLink, got {clouds[0]} without it.")
     if watch:
-        from .live import watch_folder
+        from .live import watch_source
 
         if len(clouds) != 1 or truth is not None:
-            raise ConfigError("--watch: expected one folder and no --truth.")
-        verdicts = watch_folder(
-            twin, Path(clouds[0]), output, options, unit=unit, start=start, formats=formats, budget=budget, idle=idle,
-            say=click.echo,
+            raise ConfigError("--watch: expected one folder or igtl://... and no --truth.")
+        verdicts = watch_source(
+            twin, parse_source(clouds[0]), output, options, unit=unit, axes=axes, start=start, formats=formats,
+            budget=budget, idle=idle, say=click.echo,
         )  # fmt: skip
     else:
         verdicts = register_files(
-            twin, clouds, output, options, unit=unit, start=start, truth=truth, formats=formats, budget=budget,
-            say=click.echo,
+            twin, clouds, output, options, unit=unit, axes=axes, start=start, truth=truth, formats=formats,
+            budget=budget, say=click.echo,
         )  # fmt: skip
     said = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items() if count)
     click.echo(f"{said or 'no frame'}; written to {output}\n{NOTICE}")

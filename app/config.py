@@ -279,8 +279,8 @@ class RegistrationSection(_Section):
     landmark_deviation: Positive = Field(
         0.002, description="standard deviation of where landmarks were found that pull beside the clouds, metres"
     )
-    frame: Literal["lps", "ras", "source"] = Field(
-        "lps", description="axes of what is written; source: of the organ's files, on which clouds are read in any case"
+    output_frame: Literal["lps", "ras", "source"] = Field(
+        "lps", description="axes of what is written; source: of the organ's files"
     )
     output_unit: Literal["mm", "m", "source"] = Field(
         "mm", description="unit of what is written; source: of the organ's files (nrrd, mrk.json and seq.mrb: mm)"

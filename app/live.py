@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from softtwin.meshes.files import Unit
+from softtwin.meshes.files import Axes, Unit
 
 from .config import ConfigError
 from .export import WRITTEN, Exporter
 from .landmarks import MarkFiles
 from .record import Recorder, counts, describe
-from .register import CloudFile, Scene, Start, check_any, check_budget, name_of, registered
-from .streams import Clock, Mailbox, WatchedFolder, fed
+from .register import Scene, Start, check_any, check_budget, name_of, registered
+from .sources import Address, check_idle, opened
+from .streams import Clock, Mailbox
 from .twin import Camera, Frame, Sequence, Twin
 
 
@@ -27,7 +28,7 @@ class Answer:
 
     Args:
         frame: the frame.
-        cloud: name of its file; empty for points.
+        cloud: name of its file, or what its sender calls it; empty for points without a name.
         age: from the cloud's coming to the answer, seconds.
         dropped: clouds that came and went unregistered since the frame before.
         is_late: whether the age is more than was allowed.
@@ -38,6 +39,10 @@ class Answer:
     age: float
     dropped: int
     is_late: bool
+
+
+Reply = Callable[[Answer, Mapping[str, Any]], None]
+"""What is given each answer, and its figures as they stand in the record."""
 
 
 def answers(
@@ -65,7 +70,8 @@ def answers(
         until = np.inf if budget is None else arrival.at + budget
         frame = registered(sequence, arrival.cloud, until, marks)
         age = clock() - arrival.at
-        yield Answer(frame, name_of(arrival.cloud), age, arrival.dropped, budget is not None and age > budget)
+        name = arrival.name or name_of(arrival.cloud)
+        yield Answer(frame, name, age, arrival.dropped, budget is not None and age > budget)
 
 
 def register_live(
@@ -78,6 +84,7 @@ def register_live(
     formats: tuple[str, ...] = WRITTEN,
     budget: float | None = None,
     marks: MarkFiles | None = None,
+    reply: Reply | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
     """Register what comes into a mailbox and write each frame as it is found; returns the figures of all frames.
@@ -91,6 +98,7 @@ def register_live(
         formats: of the files of each frame; none are written for `()`, which is the quickest.
         budget: as for `answers`.
         marks: landmarks that pull beside clouds in files.
+        reply: is given each answer and its figures before files are written.
         say: prints one line a frame.
 
     Raises:
@@ -103,7 +111,11 @@ def register_live(
     with Recorder(Exporter(twin, output, formats), zone) as recorder:
         for answer in answers(sequence, box, budget, marks=marks):
             figures = {"age_s": answer.age, "dropped": answer.dropped, "is_late": answer.is_late}
-            say(describe(recorder.add(answer.frame, answer.cloud, **figures)))
+            row = recorder.figures(answer.frame, answer.cloud, **figures)
+            if reply is not None:
+                reply(answer, row)
+            recorder.enter(row, answer.frame)
+            say(describe(row))
     check_any(recorder.rows)
     return recorder.rows
 
@@ -118,52 +130,60 @@ def keeping_up(rows: Collection[Mapping[str, Any]]) -> str:
     return f"{len(ages)} frames, {median:.0f} ms old (95 %: {most:.0f} ms), {late} late, {dropped} clouds dropped"
 
 
-def watch_folder(
+def watch_source(
     place: Path,
-    folder: Path,
+    source: Path | Address,
     output: Path,
     options: Mapping[str, Any],
     *,
     unit: Unit | None = None,
+    axes: Axes | None = None,
     start: Start | None = None,
     formats: tuple[str, ...] = (),
     budget: float | None = None,
     idle: float | None = None,
     say: Callable[[str], None] = print,
 ) -> dict[str, int]:
-    """Register the clouds that are written into a folder, the newest first; returns how many frames bear each verdict.
+    """Register the clouds of a source, the newest first; returns how many frames bear each verdict.
+
+    A peer of OpenIGTLink gets every answer back.
 
     Args:
         place: the twin; see `find_twin`.
-        folder: of the clouds.
+        source: of `parse_source`.
         output: folder to write to.
         options: entries of [registration] that replace the twin's.
-        unit: of the clouds; that of the twin's files if not given.
+        unit: of the clouds; if not given that of the twin's files, millimetres for a peer.
+        axes: of the clouds; if not given those of the twin's files, RAS for a peer.
         start: where the camera stands; in the body's coordinates if not given.
         formats: of the files of each frame; VTU and VTP if none.
         budget: as for `answers`.
-        idle: as for `WatchedFolder`.
+        idle: seconds without a cloud after which the watch ends; never if not given.
         say: prints a line.
 
     Raises:
-        ConfigError, FileError, CloudError, PoseError, TwinError: what cannot be used, and why.
+        ConfigError, FileError, CloudError, PoseError, TwinError, LinkError: what cannot be used, and why.
     """
     check_budget(budget)
-    if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"--watch: expected a folder, got the file {folder}.")
-    scene = Scene.of(place, options, unit)
+    check_idle(idle)
+    if isinstance(source, Address):
+        unit, axes = unit or "mm", axes or "ras"
+    elif source.exists() and not source.is_dir():
+        raise ConfigError(f"--watch: expected a folder, got the file {source}.")
+    scene = Scene.of(place, options, unit, axes)
     budget = scene.budget(budget)
-    try:
-        source = WatchedFolder(folder, lambda path: CloudFile(path, scene.outside, scene.normals), idle=idle)
-    except ValueError as error:
-        raise ConfigError(f"--idle: {error}") from None
     start = start or Start()
     marks = scene.marks(start)
+    if marks is not None and isinstance(source, Address):
+        raise ConfigError(f"--marks: expected clouds in files, which marks go with by their names, got {source}.")
     with scene.opened(start, say) as (twin, camera):
         twin.registrar()  # prepared before the first cloud is waited for
-        chosen = formats or WRITTEN
-        rows = register_live(
-            twin, fed(source), output, camera=camera, formats=chosen, budget=budget, marks=marks, say=say
-        )
-    say(keeping_up(rows))
+        with opened(source, scene, twin, idle, say) as feed:
+            rows = register_live(
+                twin, feed.box, output, camera=camera, formats=formats or WRITTEN, budget=budget, marks=marks,
+                reply=feed.reply, say=say,
+            )  # fmt: skip
+            say(keeping_up(rows))
+            if told := feed.told():
+                say(told)
     return counts(rows)

@@ -69,6 +69,12 @@ class Recorder:
             cloud: name of the cloud's file.
             **more: further figures of it.
         """
+        row = self.figures(frame, cloud, **more)
+        self.enter(row, frame)
+        return row
+
+    def figures(self, frame: Frame, cloud: str = "", **more: Any) -> dict[str, Any]:
+        """What is known of a frame, without a file of it; arguments as for `add`."""
         row: dict[str, Any] = {"frame": frame.number, "cloud": cloud, "verdict": frame.judgement.verdict.value}
         row |= {"reasons": list(frame.judgement.reasons), "seconds": frame.seconds, "files": [], **more}
         if frame.landmarks:
@@ -76,11 +82,20 @@ class Recorder:
         if frame.registration is not None:
             truth = None if self.truth is None else self.truth[frame.number]
             row |= frame_figures(self.exporter.twin, frame.registration, truth)
+        return row
+
+    def enter(self, row: dict[str, Any], frame: Frame) -> None:
+        """Write a frame's files and enter its figures.
+
+        Args:
+            row: what `figures` gave; the names of the files are set in it.
+            frame: the frame.
+        """
+        if frame.registration is not None:
             row["files"] = self.exporter.write(frame.number, frame.registration, frame.cloud)
         self.rows.append(row)
         if time.monotonic() > self._due:
             self.write()
-        return row
 
     def write(self) -> None:
         """Write the record, and the time series of the frames not refused, each whole or not at all."""

@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from tqdm import tqdm
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import ContentError, FileError, Unit, read_cloud
+from softtwin.meshes.files import Axes, ContentError, FileError, Unit, read_cloud
 from softtwin.registration.pose import Pose, read_matrix
 from softtwin.registration.unknowns import PosePrior
 
@@ -181,6 +181,7 @@ def register_files(
     options: Mapping[str, Any],
     *,
     unit: Unit | None = None,
+    axes: Axes | None = None,
     start: Start | None = None,
     truth: Path | None = None,
     formats: tuple[str, ...] = (),
@@ -195,6 +196,7 @@ def register_files(
         output: folder to write to.
         options: entries of [registration] that replace the twin's.
         unit: of the clouds; that of the twin's files if not given.
+        axes: of the clouds; those of the twin's files if not given.
         start: where the camera stands; in the body's coordinates if not given.
         truth: file of true node positions.
         formats: of the files of each frame; VTU and VTP if none.
@@ -204,7 +206,7 @@ def register_files(
     Raises:
         ConfigError, FileError, CloudError, PoseError, TwinError: what cannot be used, and why.
     """
-    scene = Scene.of(place, options, unit)
+    scene = Scene.of(place, options, unit, axes)
     clouds = find_clouds(names, scene.outside, scene.normals)
     budget = scene.budget(budget)
     positions = None if truth is None else read_truth(truth, len(clouds), scene.home.body, scene.inside)
@@ -235,20 +237,21 @@ class Scene:
     outside: Coordinates
 
     @classmethod
-    def of(cls, place: Path, options: Mapping[str, Any], unit: Unit | None) -> Scene:
+    def of(cls, place: Path, options: Mapping[str, Any], unit: Unit | None, axes: Axes | None = None) -> Scene:
         """The scene of a place; see `find_twin`.
 
         Args:
             place: the twin.
             options: as above.
             unit: of the clouds; that of the twin's files if not given.
+            axes: of the clouds; those of the twin's files if not given.
 
         Raises:
             ConfigError: there is no twin, or an option cannot be.
         """
         home = twins.find_twin(place)
         inside = coordinates_of(twins.with_options(home.config, dict(options)))
-        return cls(home, options, inside, replace(inside, unit=unit or inside.unit))
+        return cls(home, options, inside, Coordinates(unit or inside.unit, axes or inside.axes))
 
     @property
     def normals(self) -> bool:

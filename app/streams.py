@@ -27,11 +27,13 @@ class Arrival:
         cloud: it: points (p, 3) in metres, or a file.
         at: when it came, seconds of the monotonic clock.
         dropped: how many came and were replaced since the one before was taken.
+        name: by which its sender knows it; empty where it has none.
     """
 
     cloud: Cloud
     at: float
     dropped: int
+    name: str = ""
 
 
 class Mailbox:
@@ -45,13 +47,17 @@ class Mailbox:
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock, self._news = clock, threading.Condition()
-        self._slot: tuple[Cloud, float] | None = None
+        self._slot: tuple[Cloud, float, str] | None = None
         self._dropped = 0
         self._failure: BaseException | None = None
         self._is_closed = False
 
-    def put(self, cloud: Cloud) -> None:
+    def put(self, cloud: Cloud, name: str = "") -> None:
         """Leave a cloud, in the place of one that was not taken yet.
+
+        Args:
+            cloud: it.
+            name: by which its sender knows it.
 
         Raises:
             CloudError: the mailbox was closed.
@@ -60,7 +66,7 @@ class Mailbox:
             if self._is_closed:
                 raise CloudError("Mailbox.put: expected an open mailbox, got one that was closed.")
             self._dropped += self._slot is not None
-            self._slot = cloud, self._clock()
+            self._slot = cloud, self._clock(), name
             self._news.notify()
 
     def close(self, failure: BaseException | None = None) -> None:
@@ -85,9 +91,9 @@ class Mailbox:
                 if self._failure is not None:
                     raise self._failure
                 return None
-            (cloud, at), dropped = self._slot, self._dropped
+            (cloud, at, name), dropped = self._slot, self._dropped
             self._slot, self._dropped = None, 0
-            return Arrival(cloud, at, dropped)
+            return Arrival(cloud, at, dropped, name)
 
 
 def fed(source: Iterable[Cloud], clock: Clock = time.monotonic) -> Mailbox:

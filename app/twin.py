@@ -176,7 +176,7 @@ class Twin:
         """Unit and axes of what is written of its registrations; figures are in metres, on the same axes."""
         section, own = self.config.registration, self.coordinates
         unit = own.unit if section.output_unit == "source" else section.output_unit
-        return Coordinates(unit, own.axes if section.frame == "source" else section.frame)
+        return Coordinates(unit, own.axes if section.output_frame == "source" else section.output_frame)
 
     def predict(self, forces: ArrayLike) -> State:
         """The state under nodal forces: `displacement`, (n, 3), metres, and its derivatives.
@@ -341,10 +341,14 @@ class Twin:
         """
         return {name: surface.points for name, surface in self._inner(result).items()}
 
+    @property
+    def organ(self) -> str:
+        """Name of the organ's own surface among those of the structures."""
+        return "organ" if "organ" not in self.body.inner else "organ surface"
+
     def surfaces(self, result: Registration) -> dict[str, Surface]:
         """The moved surface of each structure, metres, by name: the organ's first, then the inner ones."""
-        name = "organ" if "organ" not in self.body.inner else "organ surface"
-        return {name: outer(self.body).moved(result.displacement), **self._inner(result)}
+        return {self.organ: outer(self.body).moved(result.displacement), **self._inner(result)}
 
     def _inner(self, result: Registration) -> dict[str, Surface]:
         return {

@@ -281,7 +281,7 @@ def test_figures_are_on_the_axes_of_the_twins_files(plain_twin: Twin, cloud, for
     known = Pose.identity().moved(np.array([0.0, 0.02, 0.1, 0.01, 0.0, 0.0]), np.zeros(3))
     seen = known.apply(cloud)
     plain = register_clouds(plain_twin, [seen], tmp_path / "lps", camera=known, say=lambda line: None)[0]
-    section = {"zone": "tip", "frame": "source", "output_unit": "source"}
+    section = {"zone": "tip", "output_frame": "source", "output_unit": "source"}
     twin = Turned(plain_twin.model, Config.model_validate({"registration": section}))
     turned = register_clouds(twin, [seen], tmp_path / "ras", camera=known, say=lambda line: None)[0]
     flip = np.array([-1.0, -1.0, 1.0])
@@ -338,7 +338,7 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
         "landmark_deviation": 1e-3,
         "penalty": "amplitude",
         "alpha": 0.2,
-        "frame": "ras",
+        "output_frame": "ras",
         "output_unit": "m",
         "voxel": 0.01,
         "target_points": 2,

@@ -273,7 +273,7 @@ def test_figures_are_those_of_the_files(page: Page) -> None:
 
 def test_frames_are_drawn_where_they_lie_whatever_they_were_written_in(tmp_path: Path, body: Body) -> None:
     """Their files are in metres and RAS, of an organ that nobody has said the axes of."""
-    written = {"frame": "ras", "output_unit": "m"}
+    written = {"output_frame": "ras", "output_unit": "m"}
     make_registration(tmp_path, body, 2, {"body": {"source": "liver.stl", "unit": "mm"}, "registration": written})
     found = sequences.sequence_section(tmp_path, body, Studio("no pictures"))
     assert found["coordinates"].startswith("Files: m, RAS. Forces: newtons, RAS.")

@@ -51,7 +51,7 @@ def found(body: Body) -> tuple[np.ndarray, Registration]:
 
 
 def a_twin(body: Body, unit: str = "mm", frame: str = "lps", **section: object) -> Twin:
-    entries = {"zone": "tip", "frame": frame, "output_unit": unit, "voxel": 0.01, "target_points": 3, **section}
+    entries = {"zone": "tip", "output_frame": frame, "output_unit": unit, "voxel": 0.01, "target_points": 3, **section}
     return Twin(Cantilever(body), Config.model_validate({"registration": entries}))
 
 
@@ -296,7 +296,7 @@ def test_source_writes_what_the_organ_came_in(body, tmp_path) -> None:
     config = Config.model_validate(
         {
             "body": {"source": "liver.stl", "unit": "cm", "frame": "ras"},
-            "registration": {"frame": "source", "output_unit": "source"},
+            "registration": {"output_frame": "source", "output_unit": "source"},
         }
     )
     assert Twin(Cantilever(body), config).written_in == Coordinates("cm", "ras")

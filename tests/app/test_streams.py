@@ -232,7 +232,7 @@ def test_words_that_do_not_go_together_are_refused(mesh_folder: Path, tmp_path: 
     (tmp_path / "file.xyz").write_text("0 0 0\n")
     for arguments, words in (
         (("--idle", 1.0), "--idle: expected --watch"),
-        (("--watch", "--truth", tmp_path / "file.xyz"), "--watch: expected one folder and no --truth"),
+        (("--watch", "--truth", tmp_path / "file.xyz"), "--watch: expected one folder or igtl://... and no --truth"),
         (("--watch", "--budget", 0.0), "--budget: expected a positive time"),
     ):
         assert words in run(capsys, "register", mesh_folder, tmp_path / "file.xyz", *arguments, code=2)

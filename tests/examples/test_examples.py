@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import os
 import re
 import shutil
+import signal
+import socket
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
 import follow_a_stream
+import numpy as np
 import own_forward_model
 import own_simulator
 import pytest
@@ -24,7 +31,10 @@ EXAMPLES = {
     "own_simulator",
     "train_through_equilibria",
     "run_exported_graphs",
+    "openigtlink_camera",
+    "ros2_pointcloud",
 }
+EXAMPLES_FOLDER = Path(own_forward_model.__file__).parent
 
 
 def test_every_example_is_tested_here() -> None:
@@ -75,6 +85,79 @@ def test_run_exported_graphs(small_quickstart: Path, tmp_path: Path, capsys) -> 
     main(["export", str(twin), "--directions", "5"])
     assert run_exported_graphs.main(twin) < 0.05
     assert "graphs written to" in capsys.readouterr().out
+
+
+# Who runs tests in the background may have Ctrl-C ignored, and programs inherit that.
+PROGRAM = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from softtwin.app.cli import main
+main(sys.argv[1:])
+"""
+
+
+def test_openigtlink_camera(small_quickstart: Path, tmp_path: Path) -> None:
+    """Two programs, as the example says: one registers until Ctrl-C, one is the camera."""
+    pytest.importorskip("pyigtl", reason="pyigtl is absent")
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = str(probe.getsockname()[1])
+    register = [
+        "-c",
+        PROGRAM,
+        "register",
+        str(small_quickstart),
+        f"igtl://:{port}",
+        "--watch",
+        "--output",
+        str(tmp_path),
+    ]
+    camera = [str(EXAMPLES_FOLDER / "openigtlink_camera.py"), str(small_quickstart), port, "3"]
+    with ExitStack() as ended:
+        both = []
+        for arguments in (register, camera):
+            command, out = [sys.executable, *arguments], {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+            both.append(ended.enter_context(subprocess.Popen(command, **out, text=True)))
+            ended.callback(both[-1].kill)
+        said = both[1].communicate(timeout=300)[0]
+        both[0].send_signal(signal.SIGINT)
+        told = both[0].communicate(timeout=300)[0]
+    assert both[1].returncode == 0 and said.count("tumour at") == 3, said + told
+    assert both[0].returncode == 130 and "OpenIGTLink: listening on 127.0.0.1" in told, told
+    rows = json.loads((tmp_path / "registration.json").read_text())["frames"]
+    assert [row["verdict"] for row in rows] == re.findall(r"frame \d: (\w+),", said)[: len(rows)]
+    assert len(rows) >= 2 and all(row["cloud"].startswith("camera ") for row in rows)  # the last may be interrupted
+
+
+def test_ros2_pointcloud_says_where_ros_is_not(tmp_path: Path) -> None:
+    if importlib.util.find_spec("rclpy") is not None:
+        pytest.skip("ROS 2 is here")
+    command = [sys.executable, str(EXAMPLES_FOLDER / "ros2_pointcloud.py"), str(tmp_path), "/points"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    assert "ROS 2 is absent" in done.stdout and done.stderr == ""
+
+
+def test_ros2_pointcloud_registers_what_a_topic_carries(small_quickstart: Path, monkeypatch, capsys) -> None:
+    """ROS by a stand-in of four functions: it shows the way from a message to an answer, and nothing of ROS itself."""
+    import ros2_pointcloud
+
+    cloud = np.load(small_quickstart / "demo" / "cloud.npy")
+    record = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
+    message = np.array([tuple(point) for point in cloud], record)
+    heard = []
+    stand_ins = {
+        "rclpy": {"init": lambda: None, "spin": lambda node: heard[0](message)},
+        "rclpy.qos": {"qos_profile_sensor_data": SimpleNamespace(depth=5)},
+        "sensor_msgs": {},
+        "sensor_msgs.msg": {"PointCloud2": object},
+        "sensor_msgs_py": {},
+        "sensor_msgs_py.point_cloud2": {"read_points": lambda message, field_names, skip_nans: message},
+    }
+    node = SimpleNamespace(create_subscription=lambda kind, topic, hear, quality: heard.append(hear))
+    stand_ins["rclpy"]["create_node"] = lambda name: node
+    for name, entries in stand_ins.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**entries))
+    assert ros2_pointcloud.main(small_quickstart / "twin", "/points") == 1
+    assert "frame 0: " in capsys.readouterr().out
 
 
 SCRIPT = Path(own_forward_model.__file__).parent / "slurm.sh"
