@@ -15,7 +15,7 @@ import click
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.attachment import File, parse_file, parse_regions
-from softtwin.meshes.files import Unit, stated_axes
+from softtwin.meshes.files import Axes, Unit, is_segmentation, stated_axes
 from softtwin.reference.ranks import FailedElsewhere
 
 from .config import LAWS, Config, ConfigError, parse_config, to_toml
@@ -418,11 +418,12 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 
 @softtwin.command()
 @click.argument("surface_or_mesh", type=_PATH)
+@click.option("--organ", default="", help="Label of a segmentation to build from; the liver if not given.")
 @click.option("--fixed", multiple=True, metavar="WHERE", help="What holds the organ (may be repeated).")
 @click.option(
     "--fixed-distance", type=float, default=0.0, help="How near to a file of --fixed a node is fixed, m; 0: one cell."
 )
-@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the files.")
+@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the files; m, or what a segmentation says.")
 @click.option(
     "--frame",
     type=click.Choice(["lps", "ras"], case_sensitive=False),
@@ -430,7 +431,12 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 )
 @click.option("--observed", multiple=True, metavar="WHERE", help="The side that a camera sees.")
 @click.option("--zone", "zones", multiple=True, metavar="NAME=WHERE", help="Where tools may touch (may be repeated).")
-@click.option("--inner", multiple=True, metavar="NAME=FILE", help="A vessel or tumour surface to carry along.")
+@click.option(
+    "--inner",
+    multiple=True,
+    metavar="NAME[=FILE]",
+    help="A vessel or tumour to carry along: its surface; of a segmentation NAME or NAME=LABEL.",
+)
 @click.option("--nodes", type=int, default=2000, show_default=True, help="Nodes wanted where a surface is made solid.")
 @click.option("--cell-size", type=float, default=0.0, help="Edge length instead, metres.")
 @click.option(
@@ -465,9 +471,10 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 def build(
     surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, again: bool, **given: Any
 ) -> None:
-    """Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH): mesh, equilibria, surrogate, held-out errors.
+    """Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH), or a segmentation (NII NRRD, or a folder).
 
-    A surface may have holes, crumbs, overlaps, any winding: it is made solid, and what was done to it is said.
+    Mesh, equilibria, surrogate, held-out errors. A surface may have holes, crumbs, overlaps, any winding: it is made
+    solid, and what was done to it is said. Labels of a segmentation become smooth closed surfaces.
 
     Writes OUTPUT/organ.toml with all settings; run again after an interruption, it goes on where it stopped. With
     other options or changed files it makes again what depends on them; only equilibria that were solved are never
@@ -478,6 +485,7 @@ def build(
       veins.ply                  near its points; node numbers (n,) in .npy or .txt;
                                  for --observed a surface, or (t, 3) in .npy
       near:hepatic_vein:5mm      near the --inner surface of that name
+      touching:vena_cava:5mm     where another label of the segmentation touches the organ
       ball:10,-20,35mm:15mm      centre and radius
       box:0,0,0:40,30,20mm       two corners
       halfspace:0,0,12mm:0,0,-1  a point, and the side that the normal points to
@@ -487,14 +495,17 @@ def build(
     """  # noqa: D301  (click's mark for lines that are kept)
     from .chain import build_twin
 
+    source, unit, frame = _source(str(surface_or_mesh), given["unit"], given["frame"])
     body = {
-        "source": _with_axes(_resolved(str(surface_or_mesh))),
+        "source": source,
+        "organ": given["organ"],
         "fixed": " + ".join(map(_resolved, given["fixed"])),
         "observed": " + ".join(map(_resolved, given["observed"])),
         "zones": _named("--zone", zones),
-        "inner": _named("--inner", inner),
-        "frame": given["frame"] or "",
-        **{name: given[name] for name in ("unit", "nodes", "cell_size", "grid", "fixed_distance")},
+        "inner": _labelled(inner) if is_segmentation(parse_file(source).path) else _named("--inner", inner),
+        "unit": unit,
+        "frame": frame,
+        **{name: given[name] for name in ("nodes", "cell_size", "grid", "fixed_distance")},
     }
     entries = {
         "folder": ".",
@@ -523,6 +534,26 @@ def _named(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:
             raise ConfigError(f"{flag}: expected NAME={'FILE' if flag == '--inner' else 'WHERE'}, got {pair!r}.")
         named[name] = _resolved(where)
     return named
+
+
+def _labelled(inner: tuple[str, ...]) -> dict[str, str]:
+    """Inner structures of a segmentation: NAME, NAME=LABEL or NAME=FILE."""
+    named = {}
+    for pair in inner:
+        name, equals, where = pair.partition("=")
+        if not name or (equals and not where):
+            raise ConfigError(f"--inner: expected NAME, NAME=LABEL or NAME=FILE, got {pair!r}.")
+        named[name] = _resolved(where) if equals and parse_file(where).path.is_file() else where or name
+    return named
+
+
+def _source(source: str, unit: Unit | None, frame: Axes | None) -> tuple[str, Unit, Axes | str]:
+    """The source as the configuration holds it, and the unit and axes of files that say none."""
+    if is_segmentation(parse_file(source).path):
+        from .scan import framed
+
+        return framed(source, unit, frame)
+    return _with_axes(_resolved(source)), unit or "m", frame or ""
 
 
 def _with_axes(source: str) -> str:
