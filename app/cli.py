@@ -15,7 +15,7 @@ import click
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.attachment import File, parse_file, parse_regions
-from softtwin.meshes.files import Axes, Unit, stated_axes, stated_unit
+from softtwin.meshes.files import Axes, Unit, is_segmentation, stated_axes, stated_unit
 from softtwin.reference.ranks import FailedElsewhere
 
 from .config import LAWS, Config, ConfigError, parse_config, to_toml
@@ -329,8 +329,8 @@ def register(
 
     Every frame has a verdict: accepted, doubtful or refused, with reasons. Written to the folder: registration.json,
     and for each frame the organ with displacement and force (VTU) and the moved surface of each structure, in
-    millimetres and LPS (--output-unit, --output-frame); frames.pvd opens all of it in ParaView, and with --format seq.mrb
-    frames.mrb in 3D Slicer. Clouds are read in the unit and on the axes of the organ's files (--unit, --frame).
+    millimetres and LPS (--output-unit, --output-frame); frames.pvd opens all of it in ParaView, frames.mrb (with
+    --format seq.mrb) in 3D Slicer. Clouds are read in the unit and on the axes of the organ's files (--unit, --frame).
 
     A peer of OpenIGTLink gets each answer back: a POLYDATA for every structure, the TRANSFORM pose, the STRING figures.
 
@@ -444,6 +444,7 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 
 @softtwin.command()
 @click.argument("surface_or_mesh", type=_PATH)
+@click.option("--organ", default="", help="Label of a segmentation to build from; the liver if not given.")
 @click.option("--fixed", multiple=True, metavar="WHERE", help="What holds the organ (may be repeated).")
 @click.option(
     "--fixed-distance", type=float, default=0.0, help="How near to a file of --fixed a node is fixed, m; 0: one cell."
@@ -456,7 +457,12 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 )
 @click.option("--observed", multiple=True, metavar="WHERE", help="The side that a camera sees.")
 @click.option("--zone", "zones", multiple=True, metavar="NAME=WHERE", help="Where tools may touch (may be repeated).")
-@click.option("--inner", multiple=True, metavar="NAME=FILE", help="A vessel or tumour surface to carry along.")
+@click.option(
+    "--inner",
+    multiple=True,
+    metavar="NAME[=FILE]",
+    help="A vessel or tumour to carry along: its surface; of a segmentation NAME or NAME=LABEL.",
+)
 @click.option("--nodes", type=int, default=2000, show_default=True, help="Nodes wanted where a surface is made solid.")
 @click.option("--cell-size", type=float, default=0.0, help="Edge length instead, metres.")
 @click.option(
@@ -491,9 +497,10 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 def build(
     surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, again: bool, **given: Any
 ) -> None:
-    """Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH): mesh, equilibria, surrogate, held-out errors.
+    """Build a twin from SURFACE_OR_MESH (STL PLY OBJ VTK VTU VTP MSH), or a segmentation (NII NRRD, or a folder).
 
-    A surface may have holes, crumbs, overlaps, any winding: it is made solid, and what was done to it is said.
+    Mesh, equilibria, surrogate, held-out errors. A surface may have holes, crumbs, overlaps, any winding: it is made
+    solid, and what was done to it is said. Labels of a segmentation become smooth closed surfaces.
 
     Writes OUTPUT/organ.toml with all settings; run again after an interruption, it goes on where it stopped. With
     other options or changed files it makes again what depends on them; only equilibria that were solved are never
@@ -504,6 +511,7 @@ def build(
       veins.ply                  near its points; node numbers (n,) in .npy or .txt;
                                  for --observed a surface, or (t, 3) in .npy
       near:hepatic_vein:5mm      near the --inner surface of that name
+      touching:vena_cava:5mm     where another label of the segmentation touches the organ
       ball:10,-20,35mm:15mm      centre and radius
       box:0,0,0:40,30,20mm       two corners
       halfspace:0,0,12mm:0,0,-1  a point, and the side that the normal points to
@@ -513,14 +521,16 @@ def build(
     """  # noqa: D301  (click's mark for lines that are kept)
     from .chain import build_twin
 
+    source, unit, frame = _source(str(surface_or_mesh), given["unit"], given["frame"])
     body = {
-        "source": _with_axes(_resolved(str(surface_or_mesh))),
+        "source": source,
+        "organ": given["organ"],
         "fixed": " + ".join(map(_resolved, given["fixed"])),
         "observed": " + ".join(map(_resolved, given["observed"])),
         "zones": _named("--zone", zones),
-        "inner": _named("--inner", inner),
-        "frame": given["frame"] or "",
-        "unit": given["unit"] or _stated_unit(surface_or_mesh) or "m",
+        "inner": _labelled(inner) if is_segmentation(parse_file(source).path) else _named("--inner", inner),
+        "unit": unit,
+        "frame": frame,
         **{name: given[name] for name in ("nodes", "cell_size", "grid", "fixed_distance")},
     }
     entries = {
@@ -552,15 +562,35 @@ def _named(flag: str, pairs: tuple[str, ...]) -> dict[str, str]:
     return named
 
 
+def _labelled(inner: tuple[str, ...]) -> dict[str, str]:
+    """Inner structures of a segmentation: NAME, NAME=LABEL or NAME=FILE."""
+    named = {}
+    for pair in inner:
+        name, equals, where = pair.partition("=")
+        if not name or (equals and not where):
+            raise ConfigError(f"--inner: expected NAME, NAME=LABEL or NAME=FILE, got {pair!r}.")
+        named[name] = _resolved(where) if equals and parse_file(where).path.is_file() else where or name
+    return named
+
+
+def _source(source: str, unit: Unit | None, frame: Axes | None) -> tuple[str, Unit, Axes | str]:
+    """The source as the configuration holds it, and the unit and axes of files that say none."""
+    if is_segmentation(parse_file(source).path):
+        from .scan import framed
+
+        return framed(source, unit, frame)
+    return _with_axes(_resolved(source)), unit or _stated_unit(source) or "m", frame or ""
+
+
 def _with_axes(source: str) -> str:
     """The source with the axes that it states about itself, so that the configuration holds it."""
     file = parse_file(source)
     return str(file if file.axes else replace(file, axes=stated_axes(file.path)))
 
 
-def _stated_unit(source: Path) -> Unit | None:
+def _stated_unit(source: str) -> Unit | None:
     """The unit that a source states about itself; None for one that is yet to be looked for."""
-    path = parse_file(str(source)).path
+    path = parse_file(source).path
     return stated_unit(path) if path.is_file() else None
 
 

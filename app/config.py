@@ -11,7 +11,7 @@ import tomlkit
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from softtwin.meshes.attachment import parse_file
-from softtwin.meshes.files import Axes
+from softtwin.meshes.files import SEGMENTATIONS, Axes
 
 from .unknowns import WORDS as UNKNOWNS
 from .unknowns import Unknown
@@ -20,7 +20,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 
 
-_SURFACES = (".stl", ".ply", ".obj", ".vtp")
+_SURFACES = (".stl", ".ply", ".obj", ".vtp", *SEGMENTATIONS)
 
 
 class ConfigError(ValueError):
@@ -33,8 +33,8 @@ class _Section(BaseModel):
 
 # What says where something is: `meshes/attachment.py` reads it.
 _WHERE = (
-    "near:STRUCTURE:5mm, ball:X,Y,Z:R, box:X,Y,Z:X,Y,Z, halfspace:X,Y,Z:NX,NY,NZ or seen-from:X,Y,Z "
-    "(a unit behind a number, else unit), or several with ' + ' between"
+    "near:STRUCTURE:5mm, touching:LABEL:5mm, ball:X,Y,Z:R, box:X,Y,Z:X,Y,Z, halfspace:X,Y,Z:NX,NY,NZ or "
+    "seen-from:X,Y,Z (a unit behind a number, else unit), or several with ' + ' between"
 )
 
 
@@ -43,8 +43,10 @@ class BodySection(_Section):
 
     source: str = Field(
         "liver-phantom",
-        description="a surface or mesh file (STL PLY OBJ VTK VTU VTP MSH), or a shape: liver-phantom, propeller, beam",
+        description="a surface or mesh file (STL PLY OBJ VTK VTU VTP MSH), a segmentation (NII NRRD, or a folder of "
+        "them), or a shape: liver-phantom, propeller, beam",
     )
+    organ: str = Field("", description="label of a segmentation that the body is made from; empty: the liver")
     unit: Literal["m", "cm", "mm"] = Field("m", description="unit of length in the files")
     frame: Literal["", "lps", "ras"] = Field(
         "",
@@ -74,7 +76,8 @@ class BodySection(_Section):
         default_factory=dict, description="named zones that tools may touch: files or words as for fixed"
     )
     inner: dict[str, str] = Field(
-        default_factory=dict, description="named inner surfaces (vessels, tumours): surface files"
+        default_factory=dict,
+        description="named inner surfaces (vessels, tumours): surface files, or labels of a segmentation",
     )
 
 
@@ -347,7 +350,7 @@ class Config(_Section):
     def _modes_fit_the_nodes(self) -> Config:
         """Refuse before meshing what no mesh of so many nodes has; the mesh itself is asked again."""
         most = 3 * self.body.nodes // 2
-        solid = self.body.cell_size == 0.0 and parse_file(self.body.source).path.suffix.lower() in _SURFACES
+        solid = self.body.cell_size == 0.0 and parse_file(self.body.source).path.name.lower().endswith(_SURFACES)
         if solid and self.loads.modes > most:
             raise ValueError(
                 f"loads.modes: expected at most {most} with body.nodes = {self.body.nodes}, got {self.loads.modes}"

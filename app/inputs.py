@@ -10,7 +10,7 @@ from typing import Any
 
 from softtwin.meshes.attachment import parse_file
 from softtwin.meshes.body import Body
-from softtwin.meshes.files import read_body
+from softtwin.meshes.files import is_segmentation, read_body, structure_files
 from softtwin.reference.data.dataset import DataSet, DataSetError, differences, existing
 from softtwin.reference.data.jacobians import mark
 from softtwin.reference.data.samplers import LoadPlan
@@ -19,7 +19,7 @@ from .config import Config, ConfigError
 from .workspace import Workspace, read_records
 
 # Entries that older records lack: at their default they change nothing.
-_LATER = {"training.patience": 0, "training.precision": "single", "body.grid": 0.0}
+_LATER = {"training.patience": 0, "training.precision": "single", "body.grid": 0.0, "body.organ": ""}
 _MATERIAL = {"law": "material", "young_modulus": "young_modulus", "poisson_ratio": "poisson_ratio"}
 
 
@@ -62,7 +62,13 @@ def plan_entries(config: Config) -> dict[str, Any]:
 def mesh_inputs(space: Workspace) -> dict[str, Any]:
     """Entries of [body]; one that names a file stands as the hash of its content."""
     every = _flat("body", space.config.body.model_dump())
-    return {name: _content(value, space.root) for name, value in every if _LATER.get(name, ...) != value}
+    read = {name: _content(value, space.root) for name, value in every if _LATER.get(name, ...) != value}
+    source = parse_file(space.config.body.source)
+    folder = space.root / source.path
+    if folder.is_dir() and is_segmentation(folder):
+        read["body.source"] = {path.name: f"sha256:{_sha256(path)}" for path in structure_files(folder)}
+        read["body.source axes"] = source.axes
+    return read
 
 
 def generate_inputs(space: Workspace, body: Body) -> dict[str, Any]:

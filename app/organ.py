@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from scipy.spatial import cKDTree
 from softtwin.meshes.attachment import (
     File,
     Region,
+    Touching,
     boundary_nodes,
     boundary_triangles,
     check_structure,
@@ -29,6 +31,7 @@ from softtwin.meshes.files import (
     Axes,
     FileError,
     Unit,
+    is_segmentation,
     read_cloud,
     read_mesh,
     read_surface,
@@ -40,6 +43,9 @@ from softtwin.meshes.shapes import beam, liver_phantom, propeller
 from softtwin.meshes.solidify import solidify
 
 from .config import BodySection, ConfigError, files_axes
+
+if TYPE_CHECKING:
+    from .scan import Scan
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -69,6 +75,7 @@ class _Reader:
     root: Path
     unit: Unit
     axes: Axes | None
+    scan: Scan | None = None
 
     def options(self, file: File) -> tuple[Path, Unit, Axes]:
         """Path, unit and axes to read a file with; one that says none has those of the source."""
@@ -95,19 +102,21 @@ def make_organ(section: BodySection, root: Path) -> Organ:
     """
     regions = _checked_regions(section, root)
     notes: list[str] = []
+    scan = _scan(section, root, regions)
     if section.source in SHAPES:
         reader = _Reader(root, section.unit, section.frame or "lps")
         body = SHAPES[section.source](**_shape_options(section))
     else:
         source = parse_file(section.source)
-        _check_stated(section, root)
-        reader = _Reader(root, section.unit, files_axes(section))
+        if scan is None:
+            _check_stated(section, root)
+        reader = _Reader(root, section.unit, files_axes(section), scan)
         points, cells, notes = _solid(section, reader, source)
         body = Body(points, cells, {})
         notes += [f"axes: {reader.axes.upper()}, inside LPS" if reader.axes else "axes: none said, nothing turned"]
     for name, text in section.inner.items():
-        surface = read_surface(*reader.options(parse_file(text)))
-        notes += _outside(body, name, surface)
+        surface, said = _inner(name, text, reader)
+        notes += [*said, *_outside(body, name, surface)]
         body = body.with_inner(**{name: surface})
     if regions["fixed"]:
         body = body.with_sets(fixed=_attached(body, _nodes(body, "body.fixed", regions["fixed"], section, reader)))
@@ -167,7 +176,7 @@ def _checked_regions(section: BodySection, root: Path) -> dict[str, tuple[Region
         raise BodyError(
             "body.fixed: expected what holds the organ, got nothing; without it the organ has no equilibrium. Give "
             "--fixed FILE (points or triangles near the attachment, or .npy/.txt with node numbers), or say where it "
-            "is: near:STRUCTURE:5mm, ball:X,Y,Z:RADIUS, box:X,Y,Z:X,Y,Z, halfspace:X,Y,Z:NX,NY,NZ."
+            "is: near:STRUCTURE:5mm, touching:LABEL, ball:X,Y,Z:RADIUS, box:X,Y,Z:X,Y,Z, halfspace:X,Y,Z:NX,NY,NZ."
         )
     texts = {"fixed": section.fixed, "observed": section.observed}
     texts |= {f"zones.{name}": text for name, text in section.zones.items()}
@@ -178,7 +187,8 @@ def _checked_regions(section: BodySection, root: Path) -> dict[str, tuple[Region
     for region in (region for group in regions.values() for region in group):
         check_structure(region, structures)
     files = [region for group in regions.values() for region in group if isinstance(region, File)]
-    for file in [*files, *(parse_file(text) for text in section.inner.values())]:
+    named = {} if is_segmentation(root / parse_file(section.source).path) else section.inner  # else they may be labels
+    for file in [*files, *map(parse_file, named.values())]:
         if not (root / file.path).is_file():
             raise FileError(f"{root / file.path}: no such file.")
     return regions
@@ -187,12 +197,42 @@ def _checked_regions(section: BodySection, root: Path) -> dict[str, tuple[Region
 _OWN_STRUCTURES = {"liver-phantom": ("vessel_portal", "vessel_hepatic", "tumour")}
 
 
+def _scan(section: BodySection, root: Path, regions: Mapping[str, tuple[Region, ...]]) -> Scan | None:
+    """The segmentation that is the source, or None where that is a mesh.
+
+    Raises:
+        ConfigError, FileError: see `open_scan`; words that only a segmentation knows.
+    """
+    every = [region for group in regions.values() for region in group]
+    if section.source not in SHAPES and is_segmentation(root / parse_file(section.source).path):
+        from .scan import open_scan  # a twin from a volume mesh is built where nibabel is not installed
+
+        return open_scan(section, root, every)
+    if section.organ:
+        raise ConfigError(f"body.organ: expected a segmentation as source, got {section.source}; it has no labels.")
+    if any(isinstance(region, Touching) for region in every):
+        raise ConfigError(
+            f"touching: expected a segmentation as source, got {section.source}; near: and ball: are known of it."
+        )
+    return None
+
+
+def _inner(name: str, text: str, reader: _Reader) -> tuple[Surface, list[str]]:
+    if reader.scan is not None and name in reader.scan.labels:
+        return reader.scan.inner(name)
+    return read_surface(*reader.options(parse_file(text))), []
+
+
 def _shape_options(section: BodySection) -> dict[str, float]:
     return {"cell_size": section.cell_size} if section.cell_size > 0.0 and section.source != "beam" else {}
 
 
 def _solid(section: BodySection, reader: _Reader, source: File) -> tuple[Floats, Ints, list[str]]:
-    found = read_mesh(*reader.options(source))
+    found: Surface | tuple[Floats, Ints]
+    if reader.scan is not None:
+        found, said = reader.scan.surface()
+    else:
+        found, said = read_mesh(*reader.options(source)), []
     points = found.points if isinstance(found, Surface) else found[0]
     _check_size(reader.root / source.path, float(np.ptp(points, axis=0).max()), source.unit or section.unit)
     if not isinstance(found, Surface):
@@ -201,7 +241,7 @@ def _solid(section: BodySection, reader: _Reader, source: File) -> tuple[Floats,
         solid = solidify(found, cell_size=section.cell_size)
     else:
         solid = solidify(found, node_count=section.nodes)
-    return solid.points, solid.cells, str(solid.mending).splitlines()
+    return solid.points, solid.cells, said + str(solid.mending).splitlines()
 
 
 def _check_size(path: Path, size: float, unit: Unit) -> None:
@@ -250,10 +290,18 @@ def _nodes(body: Body, name: str, regions: Iterable[Region], section: BodySectio
     parts = [
         _nodes_of_file(body, name, region, near or median_edge(body), reader)
         if isinstance(region, File)
+        else _nodes_touched(body, region, reader)
+        if isinstance(region, Touching)
         else boundary_nodes(region, body)
         for region in regions
     ]
     return np.unique(np.concatenate(parts))
+
+
+def _nodes_touched(body: Body, region: Touching, reader: _Reader) -> Ints:
+    assert reader.scan is not None  # refused before
+    nodes = body.boundary_nodes
+    return nodes[reader.scan.near(region, body.points[nodes], median_edge(body))]
 
 
 def _nodes_of_file(body: Body, name: str, file: File, near: float, reader: _Reader) -> Ints:
@@ -296,7 +344,11 @@ def _read_numbers(path: Path) -> Ints | None:
 def _observed(body: Body, regions: Iterable[Region], reader: _Reader) -> tuple[Ints, list[str]]:
     """Boundary triangles of a union of regions, each once and wound outward, and what to say of it."""
     parts = [
-        _triangles_of_file(body, region, reader) if isinstance(region, File) else boundary_triangles(region, body)
+        _triangles_of_file(body, region, reader)
+        if isinstance(region, File)
+        else _triangles_touched(body, region, reader)
+        if isinstance(region, Touching)
+        else boundary_triangles(region, body)
         for region in regions
     ]
     given = np.concatenate(parts)
@@ -312,6 +364,11 @@ def _observed(body: Body, regions: Iterable[Region], reader: _Reader) -> tuple[I
     outward = (shifted == body.boundary[np.array(numbers)]).all(axis=2).any(axis=0)
     turned = int((~outward).sum())
     return chosen, [f"observed: {turned} of {len(given)} triangles wound inward and were turned"] if turned else []
+
+
+def _triangles_touched(body: Body, region: Touching, reader: _Reader) -> Ints:
+    assert reader.scan is not None  # refused before
+    return body.boundary[reader.scan.near(region, body.points[body.boundary].mean(axis=1), median_edge(body))]
 
 
 def _triangles_of_file(body: Body, file: File, reader: _Reader) -> Ints:

@@ -12,7 +12,7 @@ import sys
 from importlib.util import find_spec
 
 FENICSX = ("dolfinx", "dolfinx_solver", "ufl", "basix", "ffcx", "petsc4py", "slepc4py")
-MESH_PACKAGES = {"gmsh", "pyacvd", "pytetwild", "pyvista"}
+MESH_PACKAGES = {"gmsh", "nibabel", "nrrd", "pyacvd", "pytetwild", "pyvista"}
 PACKAGES = ("softtwin.meshes", "softtwin.reference.data", "softtwin.surrogate", "softtwin.registration")
 
 

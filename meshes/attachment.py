@@ -8,6 +8,8 @@ are in a unit that the caller names, the place's unit stands behind its last num
     box:0,0,0:40,30,20mm            two opposite corners
     halfspace:0,0,12mm:0,0,-1       the side of the plane through the point to which the normal points
     seen-from:0,-400,100mm          what a camera at the place sees
+    touching:vena_cava:5mm          where another label of the segmentation touches the organ; without a distance:
+                                    a voxel's diagonal or one cell, whichever is larger
     veins.ply, veins.ply:mm:ras     near the points of a file, with its unit and axes where it has others
 """
 
@@ -28,7 +30,7 @@ from .metrics import edge_lengths
 
 Vector = tuple[float, float, float]
 Flags = NDArray[np.bool_]
-WORDS = ("near", "ball", "box", "halfspace", "seen-from")
+WORDS = ("near", "touching", "ball", "box", "halfspace", "seen-from")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _LENGTH = re.compile(rf"\s*({_NUMBER})\s*([a-z]*)\s*")
 
@@ -47,6 +49,19 @@ class Near:
     """
 
     structure: str
+    distance: float | None = None
+
+
+@dataclass(frozen=True)
+class Touching:
+    """What lies within a distance of another label of the segmentation that the body was made from.
+
+    Args:
+        label: its name.
+        distance: metres; None for a voxel's diagonal, or the median edge of the body where that reaches too few nodes.
+    """
+
+    label: str
     distance: float | None = None
 
 
@@ -100,7 +115,7 @@ class File:
 
 
 Shape = Near | Ball | Box | HalfSpace | SeenFrom
-Region = Shape | File
+Region = Shape | Touching | File
 
 
 def parse_region(text: str, unit: Unit = "m") -> Region:
@@ -278,11 +293,12 @@ def _triple(vector: Vector) -> str:
     return f"({', '.join(f'{1e3 * x:g}' for x in vector)}) mm"
 
 
-def _parse_shape(word: str, parts: list[str], unit: Unit) -> Shape:
-    if word == "near":
+def _parse_shape(word: str, parts: list[str], unit: Unit) -> Shape | Touching:
+    if word in ("near", "touching"):
         if len(parts) not in (1, 2) or not parts[0]:
-            raise ValueError("expected near:NAME or near:NAME:DISTANCE.")
-        return Near(parts[0], _positive("distance", parts[1], unit) if len(parts) == 2 else None)
+            raise ValueError(f"expected {word}:NAME or {word}:NAME:DISTANCE.")
+        distance = _positive("distance", parts[1], unit) if len(parts) == 2 else None
+        return Near(parts[0], distance) if word == "near" else Touching(parts[0], distance)
     if word == "ball":
         _check_parts(parts, 2, "ball:X,Y,Z:RADIUS")
         return Ball(_place("centre", parts[0], unit), _positive("radius", parts[1], unit))

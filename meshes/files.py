@@ -40,6 +40,7 @@ _MESHIO = (".stl", ".obj", ".msh")
 _VTK: Mapping[str, Any] = {".vtk": vtkDataSetReader, ".vtu": vtkXMLUnstructuredGridReader, ".vtp": vtkXMLPolyDataReader}
 _FIRST_MSH = {1: "line", 2: "triangle", 3: "quad", 4: "tetra", 5: "hexahedron", 15: "vertex"}  # gmsh's element types
 _TEXT = (".txt", ".csv", ".xyz")
+SEGMENTATIONS = (".nii", ".nii.gz", ".nrrd")
 _PCD = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
 _TURN = np.array([-1.0, -1.0, 1.0])  # from RAS to LPS and back
 _VTK_NODES = {kind.vtk: (kind.name, kind.nodes) for kind in KINDS.values()}
@@ -91,6 +92,33 @@ def in_metres(lengths: ArrayLike, unit: Unit) -> Floats:
     """
     # Dividing by a whole number rounds once; multiplying by 0.001 would round twice.
     return np.asarray(lengths, dtype=np.float64) / round(1 / _METRES[unit])
+
+
+def is_labelmap(path: str | Path) -> bool:
+    """Whether a file is one of segmented voxels, by its name (`labelmap.py` reads it).
+
+    Args:
+        path: the file.
+    """
+    return Path(path).name.lower().endswith(SEGMENTATIONS)
+
+
+def is_segmentation(path: str | Path) -> bool:
+    """Whether something may be a segmentation: a label map by its name, or a folder that holds some.
+
+    Args:
+        path: file or folder.
+    """
+    return bool(structure_files(path)) if Path(path).is_dir() else is_labelmap(path)
+
+
+def structure_files(folder: str | Path) -> list[Path]:
+    """The label maps in a folder, in order.
+
+    Args:
+        folder: as TotalSegmentator writes it, with a file for each structure.
+    """
+    return sorted(path for path in Path(folder).iterdir() if path.is_file() and is_labelmap(path))
 
 
 def stated_axes(path: str | Path) -> Axes | None:

@@ -17,7 +17,7 @@ LIVER = Path(__file__).parents[2] / "shared" / "data" / "liver"
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does: else tests on busy cores crawl
 
-for folder in ("benchmarks", "examples"):
+for folder in ("benchmarks", "examples", "tests"):
     sys.path.insert(0, str(Path(__file__).parents[1] / folder))
 
 

@@ -1,0 +1,144 @@
+"""The organ of a configuration whose source is a segmentation: its surface, what lies inside, what touches it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from softtwin.meshes.attachment import File, Region, RegionError, Touching, parse_file
+from softtwin.meshes.body import Floats, Surface
+from softtwin.meshes.files import Axes, Unit
+from softtwin.meshes.segmentation import (
+    Segmentation,
+    distances_to,
+    find,
+    frame_of,
+    inner_surface,
+    organ_surface,
+    read_segmentation,
+    the_organ,
+    voxel_diagonal,
+)
+
+from .config import BodySection, ConfigError, files_axes
+
+_FEW = 3  # points: fewer hold no body
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A segmentation, and which of its labels a body is made of.
+
+    Args:
+        segmentation: the labels.
+        organ: the label of the body.
+        labels: label of each inner structure that is no file, by the structure's name.
+    """
+
+    segmentation: Segmentation
+    organ: str
+    labels: Mapping[str, str]
+
+    def surface(self) -> tuple[Surface, list[str]]:
+        """The organ's surface, and what to say of it.
+
+        Raises:
+            FileError: it is one voxel thick.
+        """
+        return organ_surface(self.segmentation, self.organ, self.labels.values())
+
+    def inner(self, name: str) -> tuple[Surface, list[str]]:
+        """The surface of an inner structure, and what to say of it.
+
+        Raises:
+            FileError: it is one voxel thick.
+        """
+        return inner_surface(self.segmentation, self.labels[name])
+
+    def near(self, region: Touching, points: Floats, edge: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Which points of the organ's boundary another label touches, (p,).
+
+        Where the region says no distance it is one voxel's diagonal, or, where too few points for an attachment lie
+        that near, as in a coarse mesh, one cell.
+
+        Args:
+            region: the label, and how near.
+            points: (p, 3), metres.
+            edge: of a cell, metres.
+
+        Raises:
+            RegionError: none, with how far away it is.
+        """
+        away = distances_to(self.segmentation, region.label, points)
+        reach = region.distance or voxel_diagonal(self.segmentation, region.label)
+        if region.distance is None and (away <= reach).sum() < _FEW:
+            reach = max(edge, reach)
+        if not (away <= reach).any():
+            raise RegionError(
+                f"touching {region.label}: expected it within {1e3 * reach:.3g} mm of {self.organ}, it is "
+                f"{1e3 * away.min():.3g} mm away; touching:{region.label}:{np.ceil(1e3 * away.min()) + 1:g}mm reaches "
+                "it, if it holds the organ at all."
+            )
+        return away <= reach
+
+
+def open_scan(section: BodySection, root: Path, regions: Iterable[Region]) -> Scan:
+    """The segmentation of a configuration, whose labels are all there.
+
+    Args:
+        section: the configuration's [body].
+        root: folder that relative paths start from.
+        regions: of attachment, zones and observed side.
+
+    Raises:
+        ConfigError: another unit or other axes than the file's.
+        FileError: it cannot be read, or lacks a label.
+    """
+    path = root / parse_file(section.source).path
+    _check_frame(section, path)
+    segmentation = read_segmentation(path, files_axes(section))
+    inner = {name: text for name, text in section.inner.items() if not (root / parse_file(text).path).is_file()}
+    scan = Scan(segmentation, section.organ or the_organ(segmentation), inner)
+    touched = [region.label for region in regions if isinstance(region, Touching)]
+    for label in (scan.organ, *inner.values(), *touched):
+        find(segmentation, label)
+    return scan
+
+
+def framed(source: str, unit: Unit | None, frame: Axes | None) -> tuple[str, Unit, Axes]:
+    """Source with its whole path and axes, unit and axes, as a segmentation says them itself.
+
+    Args:
+        source: file or folder, with unit and axes behind it or not.
+        unit: that the user says.
+        frame: axes that the user says.
+
+    Raises:
+        ConfigError: the user says something else than the file, or nobody says the axes.
+        FileError: it cannot be read.
+    """
+    file = parse_file(source)
+    stated, axes = frame_of(file.path)
+    for flag, told, said in (("--unit", file.unit or unit, stated), ("--frame", file.axes or frame, axes)):
+        if told and said and told != said:
+            raise ConfigError(
+                f"{flag}: expected {said}, which {file.path} says of itself, got {told}. Coordinates are in the file's "
+                "own unit and axes; other files have theirs behind the name (veins.ply:cm:lps)."
+            )
+    found = axes or file.axes or frame
+    if found is None:
+        raise ConfigError(f"--frame: expected lps or ras, since {file.path} says no space of its own.")
+    return str(File(file.path.resolve(), None, found)), stated, found
+
+
+def _check_frame(section: BodySection, path: Path) -> None:
+    """Refuse a configuration that says something else than its source: clouds would be read otherwise later."""
+    unit, axes = frame_of(path)
+    if section.unit != unit:
+        raise ConfigError(f'body.unit: {path} is in {unit}, got {section.unit!r}; write unit = "{unit}".')
+    if axes and files_axes(section) != axes:
+        written = File(parse_file(section.source).path, None, axes)
+        raise ConfigError(f'body.source: {path} is in {axes.upper()}, expected source = "{written}".')
