@@ -9,7 +9,7 @@ are in a unit that the caller names, the place's unit stands behind its last num
     halfspace:0,0,12mm:0,0,-1       the side of the plane through the point to which the normal points
     seen-from:0,-400,100mm          what a camera at the place sees
     touching:vena_cava:5mm          where another label of the segmentation touches the organ; without a distance:
-                                    a voxel's diagonal or one cell, whichever is larger
+                                    a voxel's diagonal, or one cell where that reaches too few nodes
     veins.ply, veins.ply:mm:ras     near the points of a file, with its unit and axes where it has others
 """
 

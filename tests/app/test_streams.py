@@ -254,6 +254,7 @@ def test_a_folder_is_watched_until_it_is_interrupted(small_quickstart: Path, tmp
     ):
         ended.callback(process.kill)  # whatever fails here, nothing is waited for
         assert process.stdout is not None
+        assert "results in mm, LPS" in process.stdout.readline()
         for number in range(2):
             np.savetxt(folder / ".next.xyz", cloud)
             (folder / ".next.xyz").rename(folder / f"cloud_{number}.xyz")
