@@ -1,4 +1,4 @@
-"""What the pages claim: figures are those of docs/results.md, each credibility factor has evidence or says it has none."""
+"""Figures are those of docs/results.md; each credibility factor has evidence or says that it has none."""
 
 from __future__ import annotations
 
