@@ -6,6 +6,7 @@ cd "$ROOT"
 exec 9<"$ROOT"
 flock 9 # two set-ups at once would break each other's virtual environment
 
+EXTRAS=${SOFTTWIN_EXTRAS:-torch,mesh,app,dev}
 PACKAGES=(
     # FEniCSx with PETSc, SLEPc and MPI, and a BLAS that does not make MUMPS 4 times slower
     python3-dolfinx-real python3-petsc4py-real python3-slepc4py-real python3-mpi4py python3-scipy
@@ -70,7 +71,7 @@ install_project() {
     local pins stamp="$VENV/.softtwin-stamp" wanted
     pins=$(constraints)
     [ "$pins" != /dev/null ] || say "virtual environment: ci/constraints.txt is for Python 3.11, taking unpinned versions"
-    wanted=$(fingerprint "$VENV $("$SYSTEM_PYTHON" -V)" pyproject.toml "$pins")
+    wanted=$(fingerprint "$VENV $EXTRAS $("$SYSTEM_PYTHON" -V)" pyproject.toml "$pins")
     if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$wanted" ] && "$VENV/bin/python" -c 'import softtwin.meshes' 2>/dev/null; then
         say "virtual environment: .venv is up to date"
         return
@@ -83,7 +84,7 @@ install_project() {
     fi
     rm -f "$stamp"
     say "virtual environment: installing the project and its pinned dependencies (about 3 minutes the first time)"
-    "$VENV/bin/python" -m pip install -q -c "$pins" --editable '.[torch,mesh,app,dev]' </dev/null
+    "$VENV/bin/python" -m pip install -q -c "$pins" --editable ".[$EXTRAS]" </dev/null
     rm -rf "$ROOT/softtwin.egg-info" # a by-product: seen from this folder, it makes pkg_resources warn
     "$VENV/bin/python" -c 'import dolfinx, torch, softtwin.meshes' # before the stamp says that all is well
     echo "$wanted" >"$stamp"

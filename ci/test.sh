@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # All set-up, then every check and test. All groups run; one line each at the end says what ran, and the exit code is
-# 1 when any failed. Arguments name the groups to run (all by default): format lint types layers tests liver
-# no-fenicsx dolfinx-0.11.
+# 1 when any failed. Arguments name the groups to run (all by default): format lint types layers docs tests
+# liver no-fenicsx dolfinx-0.11.
 set -uo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 cd "$ROOT"
@@ -38,6 +38,8 @@ lint() {
 types() { mypy | sed 's#^\.venv/types/softtwin/##'; } # the links' names mean nothing to a reader
 layers() { lint-imports --no-logo; }
 
+docs() { NO_MKDOCS_2_WARNING=1 mkdocs build --strict && echo "site: build/site/index.html, $(find build/site -name '*.html' | wc -l) pages"; }
+
 # run_tests NAME ARGUMENTS...: pytest, then the count by folder, which fails when a folder that can run was all skipped.
 run_tests() {
     local name=$1 status
@@ -67,6 +69,7 @@ group format format
 group lint lint
 group types types
 group layers layers
+group docs docs
 group tests tests
 group liver liver
 group no-fenicsx slow bash ci/no-fenicsx.sh "$LOGS/no-fenicsx.xml"

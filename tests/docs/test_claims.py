@@ -1,0 +1,67 @@
+"""Figures are those of docs/results.md; each credibility factor has evidence or says that it has none."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+RESULTS = (DOCS / "results.md").read_text()
+CREDIBILITY = (DOCS / "credibility.md").read_text()
+
+# ASME V&V 40-2018: verification of code and calculation, validation of model, comparator and assessment, applicability.
+FACTORS = [
+    "Software quality assurance",
+    "Numerical code verification",
+    "Discretisation error",
+    "Numerical solver error",
+    "Use error",
+    "Model form",
+    "Model inputs",
+    "Test samples",
+    "Test conditions",
+    "Equivalency of input parameters",
+    "Output comparison",
+    "Relevance of the quantities of interest",
+    "Relevance of the validation activities to the context of use",
+]
+
+
+def factors() -> dict[str, str]:
+    """Text of each numbered section by its heading."""
+    parts = re.split(r"^### (\d+\. .+)$", CREDIBILITY, flags=re.M)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def test_all_thirteen_factors_are_there_in_their_order() -> None:
+    assert list(factors()) == [f"{number}. {name}" for number, name in enumerate(FACTORS, start=1)]
+
+
+@pytest.mark.parametrize("name", list(factors()))
+def test_each_factor_has_evidence_or_says_that_it_has_none(name: str) -> None:
+    text = factors()[name]
+    evidence = re.findall(r"\]\([\w.#/-]+\.md[^)]*\)|`tests/[\w/.]+`", text)
+    assert evidence or "**Not done**" in text or "Net forces are compared" in text
+
+
+def test_the_page_claims_no_conformity_and_no_living_organ() -> None:
+    assert "no claim of conformity" in CREDIBILITY and "no validation against a living organ" in CREDIBILITY
+    assert CREDIBILITY.count("**Not done**") >= 8
+
+
+def test_coverage_is_quoted_as_the_results_have_it() -> None:
+    table = (DOCS / "doubt.md").read_text().partition("## How often the truth kept it")[2]
+    rows = re.findall(r"^\| ([^|]+) \| (\d+) \| (\d+) \| (\d+) \|", table, flags=re.M)
+    assert len(rows) >= 8
+    assert [row for row in rows if " / ".join(row[1:]) not in RESULTS] == []
+
+
+@pytest.mark.parametrize("page", ["doubt.md", "credibility.md"])
+def test_figures_with_decimals_stand_in_the_results(page: str) -> None:
+    """Millimetres and per cent with a decimal point, as the pages quote them; what a reader chooses is in code."""
+    text = re.sub(r"```.*?```|`[^`]*`", "", (DOCS / page).read_text(), flags=re.S)
+    quoted = set(re.findall(r"(?<![\d.])(\d+\.\d+)(?= mm| %| \(asked| where)", text))
+    assert len(quoted) >= 2
+    assert [figure for figure in sorted(quoted) if figure not in RESULTS] == []

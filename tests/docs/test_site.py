@@ -1,0 +1,106 @@
+"""The site builds without a warning, and nothing that a browser loads comes from elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mkdocs", reason="the extra docs is absent")
+pytest.importorskip("material", reason="the extra docs is absent")
+
+ROOT = Path(__file__).resolve().parents[2]
+LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "video": "src", "link": "href"}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if not (ROOT / ".venv" / "types" / "softtwin").is_dir():
+        pytest.skip("ci/setup.sh has not laid the folders under one name in .venv/types")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    assert told.returncode == 0, told.stdout + told.stderr
+    return folder
+
+
+class _Loads(HTMLParser):
+    """Addresses that a page has its browser load."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        told = dict(attrs)
+        if tag in LOADED and told.get("rel") != "canonical" and told.get(LOADED[tag]):
+            self.found.append(str(told[LOADED[tag]]))
+
+
+def loads(page: Path) -> list[str]:
+    parser = _Loads()
+    parser.feed(page.read_text())
+    return parser.found
+
+
+def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    found = [address for page in pages for address in loads(page)]
+    assert len(pages) > 20 and len(found) > 5 * len(pages)
+    assert [address for address in found if re.match(r"(\w+:)?//", address)] == []
+    styles = "".join(path.read_text() for path in site.rglob("*.css"))
+    assert styles and re.findall(r"url\(\s*[\"']?(?:https?:)?//|@import[^;]*//", styles) == []
+
+
+def test_the_reference_has_what_the_docstrings_say(site: Path) -> None:
+    """Mkdocstrings renders a module whose docstrings it cannot find without a word."""
+    text = (site / "api" / "app.html").read_text()
+    assert 'id="softtwin.app.twin.Twin.register"' in text
+    assert "What does not depend on the cloud" in text or "Raises:" in text
+    pages = {page.stem: page.read_text().count('id="softtwin.') for page in (site / "api").glob("*.html")}
+    assert all(pages[stage] > 50 for stage in ("app", "meshes", "reference", "registration", "surrogate"))
+
+
+@contextlib.contextmanager
+def served(folder: Path) -> Iterator[str]:
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *told: object) -> None:
+            """Nothing."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+def test_a_browser_asks_nobody_else_and_finds_what_is_searched_for(site: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is absent")
+    browser_path = shutil.which("chromium")
+    if browser_path is None:
+        pytest.skip("chromium is absent")
+    asked, wrong = [], []
+    with served(site) as address, playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("response", lambda answer: wrong.append(answer.url) if answer.status >= 400 else None)
+        for name in ("index", "tutorial", "credibility", "api/registration"):
+            page.goto(f"{address}/{name}.html", wait_until="load")
+        page.fill("input.md-search__input", "Taylor")
+        page.wait_for_selector(".md-search-result__item", timeout=30_000)
+        browser.close()
+        assert asked and [url for url in asked if not url.startswith((address, "data:", "blob:"))] == []
+        assert wrong == []
