@@ -78,6 +78,7 @@ install_project() {
     fi
     rm -f "$stamp"
     say "virtual environment: installing the project and its dependencies (some minutes the first time)"
+    if [ "$WAY" = wheels ]; then announce_torch; fi
     "$VENV/bin/python" -m pip install -q -c "$pins" --editable ".[$EXTRAS]" </dev/null
     rm -rf "$ROOT/softtwin.egg-info" # a by-product: seen from this folder, it makes pkg_resources warn
     # Before the stamp says that all is well; PyPI's DOLFINx wants its solvers first, which this module knows.
@@ -108,7 +109,6 @@ case $WAY in
         VENV_OPTIONS=()
         say "FEniCSx: wheels from PyPI for $SYSTEM_PYTHON"
         check_machine "$SYSTEM_PYTHON"
-        announce_torch
         ;;
     present)
         has_fenicsx "$SYSTEM_PYTHON" || fail "SOFTTWIN_PYTHON: $SYSTEM_PYTHON has no FEniCSx"

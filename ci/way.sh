@@ -61,3 +61,11 @@ wheel_python() {
   Install one (Fedora, openSUSE, Arch, Ubuntu 24.04 and newer have it), name it by SOFTTWIN_PYTHON=/path/to/python3.12,
   or go on without FEniCSx, to train and register only:  pip install 'softtwin[torch,mesh,app]'"
 }
+
+# The real path of a Python 3.12 (the pins are for it): on PATH, or kept by pyenv, whose shim may point nowhere.
+second_python() {
+    local candidate
+    for candidate in python3.12 "${PYENV_ROOT:-$HOME/.pyenv}"/versions/3.12*/bin/python3.12; do
+        if "$candidate" -c 'import sys, venv; print(sys.executable)' 2>/dev/null; then return; fi
+    done
+}
