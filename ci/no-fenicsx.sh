@@ -11,12 +11,12 @@ WANTED=$(fingerprint "$BARE $("$SYSTEM_PYTHON" -V)" pyproject.toml ci/constraint
 
 MOST_BYTES=1500000000 # of a machine that only registers, where torch is the build for the CPU
 
-# Measured once all that registers was imported: Python has then written what it compiles of it.
+# As installed: what Python itself compiles and writes down later, unless PYTHONDONTWRITEBYTECODE is set, adds 2 %.
 check_size() {
     local size
     size=$(du -sB1 "$BARE" | cut -f1)
     say "softtwin[register]: $((size / 1000000)) MB on disk, of $((MOST_BYTES / 1000000)) at most"
-    if ! "$BARE/bin/python" -c 'import sys, torch; sys.exit(torch.version.cuda is not None)'; then
+    if ! "$BARE/bin/python" -Bc 'import sys, torch; sys.exit(torch.version.cuda is not None)'; then
         say "this torch is the build for CUDA, whose size is not softtwin's: not held against the bound"
     elif [ "$size" -gt "$MOST_BYTES" ]; then
         fail "softtwin[register] takes more than $((MOST_BYTES / 1000000)) MB; the largest parts:
@@ -38,8 +38,8 @@ if [ ! -f "$STAMP" ] || [ "$(cat "$STAMP")" != "$WANTED" ]; then
     "$SYSTEM_PYTHON" -m venv "$BARE"
     # All pins but VTK's: register asks for a smaller one.
     "$BARE/bin/python" -m pip install -q --no-compile -c <(grep -v '^vtk==' ci/constraints.txt) "$WHEEL[register]"
-    (cd / && "$BARE/bin/python" "$ROOT/ci/import_fast_path.py" --register)
     check_size
+    (cd / && "$BARE/bin/python" "$ROOT/ci/import_fast_path.py" --register)
     "$BARE/bin/python" -m pip install -q -c ci/constraints.txt "$WHEEL[torch,mesh,app,onnx,test]"
     echo "$WANTED" >"$STAMP"
 fi
