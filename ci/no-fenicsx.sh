@@ -11,7 +11,7 @@ WANTED=$(fingerprint "$BARE $("$SYSTEM_PYTHON" -V)" pyproject.toml ci/constraint
 
 MOST_BYTES=1500000000 # of a machine that only registers, where torch is the build for the CPU
 
-# As installed: what Python itself compiles and writes down later, unless PYTHONDONTWRITEBYTECODE is set, adds 2 %.
+# As installed: what Python compiles and writes down in use, unless PYTHONDONTWRITEBYTECODE is set, adds 70 MB.
 check_size() {
     local size
     size=$(du -sB1 "$BARE" | cut -f1)
