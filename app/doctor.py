@@ -13,17 +13,22 @@ import sysconfig
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
+
+from .installation import Way, fenicsx_way, launcher, what_it_brings
 
 Status = Literal["ok", "warning", "missing"]
 
 DISCLAIMER = "Research software: not a medical device."
-_SYSTEM_FENICSX = (
-    "only the reference needs it: apt-get install python3-dolfinx-real python3-slepc4py-real, "
-    "or with Python >= 3.12: pip install 'softtwin[fenicsx]'"
+_FENICSX_BRINGS = (
+    "the reference: equilibria, data sets, softtwin build and the engines reference and hybrid; not for registration. "
+    "Debian 12 and 13: apt-get install python3-dolfinx-real python3-slepc4py-real; another Linux with Python >= 3.12: "
+    "pip install 'softtwin[fenicsx]'; or conda: docs/installation.md"
 )
-_PROBE_TIMEOUT_S = 8
+_RENDERING_TIMEOUT_S = 30  # VTK is loaded from disk for it
+_COMPILER_BRINGS = "the reference's forms, which FFCx compiles at run time; not for registration"
 _SCARCE_DISK = 2e9  # bytes: a virtual environment or a data set of some thousand samples no longer fits
 # A red background, rendered without a screen and read back: the pixel proves what no version number does.
 _RENDER = """
@@ -63,7 +68,9 @@ class Check:
 def checks() -> list[Check]:
     """All facts about this machine, in reading order; something missing is a line and never an error."""
     # FEniCSx first: the libraries it loads are what the BLAS line looks at.
-    fenicsx = [_guarded(name, look, _SYSTEM_FENICSX if name == "dolfinx" else "") for name, look in _FENICSX.items()]
+    way = _guarded("fenicsx", _fenicsx_way, _FENICSX_BRINGS)
+    parts = {} if way.status == "missing" else _FENICSX_PARTS  # one line is enough to say that it is not there
+    fenicsx = [way, *(_guarded(name, look, advice) for name, (look, advice) in parts.items())]
     core = [_guarded(name, look, advice) for name, (look, advice) in {**_CORE, **_required()}.items()]
     return [*core, *fenicsx, *(_guarded(name, look, "") for name, look in _MACHINE.items())]
 
@@ -101,7 +108,8 @@ def _package(name: str, extra: str) -> tuple[Callable[[], Check], str]:
             importlib.import_module(module)
         return Check(name, "ok", version)
 
-    return look, f"pip install 'softtwin[{extra}]'" if extra else "pip install softtwin"
+    command = f"pip install 'softtwin[{extra}]'" if extra else "pip install softtwin"
+    return look, f"{what_it_brings(name, extra)}: {command}"
 
 
 def _required() -> dict[str, tuple[Callable[[], Check], str]]:
@@ -157,6 +165,18 @@ def _fenicsx() -> Any:
     return importlib.import_module("softtwin.reference.fem.fenicsx")
 
 
+def _fenicsx_way() -> Check:
+    way = fenicsx_way()
+    if way is Way.NONE:
+        return Check("fenicsx", "missing", way.value, _FENICSX_BRINGS)
+    return Check("fenicsx", "ok", f"{way.value}: {_folder_of('dolfinx')}")
+
+
+def _folder_of(module: str) -> str:
+    found = find_spec(module)
+    return str(Path(found.origin).parent) if found and found.origin else "no folder"
+
+
 def _dolfinx() -> Check:
     return Check("dolfinx", "ok", _fenicsx().dolfinx.__version__)
 
@@ -205,28 +225,22 @@ def _vendor() -> str:
 
 
 def _mpirun() -> Check:
-    path = shutil.which("mpirun")
-    if path is None:
-        return Check("mpirun", "missing", "not on PATH", "many ranks need it: apt-get install openmpi-bin")
-    told = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S).stdout
-    vendor = launcher_vendor(told)
+    found = launcher()
+    if found is None:
+        advice = "many ranks, so that a data set is solved on all cores: apt-get install openmpi-bin; with wheels: "
+        return Check("mpirun", "missing", "not on PATH", f"{advice}pip install mpich")
     built = _vendor()
-    if built and not built.startswith(vendor):
+    if built and not built.startswith(found.vendor):
         advice = "every rank would run alone: put the mpirun of the MPI that mpi4py is built with first on PATH"
-        return Check("mpirun", "warning", f"{path} is {vendor}, mpi4py is built with {built}", advice)
-    if vendor == "Open MPI" and os.geteuid() == 0 and "OMPI_ALLOW_RUN_AS_ROOT" not in os.environ:
+        return Check("mpirun", "warning", f"{found.path} is {found.vendor}, mpi4py is built with {built}", advice)
+    if found.vendor == "Open MPI" and os.geteuid() == 0 and "OMPI_ALLOW_RUN_AS_ROOT" not in os.environ:
         advice = "export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1"
-        return Check("mpirun", "warning", f"{path}, {vendor}: refuses to run as root", advice)
-    return Check("mpirun", "ok", f"{path}, {vendor}")
-
-
-def launcher_vendor(told: str) -> str:
-    """Whose `mpirun` it is, from what `mpirun --version` printed: named as mpi4py names it."""
-    if "Open MPI" in told or "OpenRTE" in told:
-        return "Open MPI"
-    if "HYDRA" in told:
-        return "Intel MPI" if "Intel" in told else "MPICH"
-    return (told.strip().splitlines() or ["an unknown MPI"])[0]
+        return Check("mpirun", "warning", f"{found.path}, {found.vendor}: refuses to run as root", advice)
+    first = shutil.which("mpirun")
+    if first and Path(first).resolve() != found.path.resolve():
+        advice = f"softtwin takes {found.path}; put its folder first on PATH before you call mpirun yourself"
+        return Check("mpirun", "warning", f"{first} is first on PATH, and another one", advice)
+    return Check("mpirun", "ok", f"{found.path}, {found.vendor}")
 
 
 def loaded_blas(maps: str) -> dict[str, str]:
@@ -291,22 +305,25 @@ def _compiler() -> Check:
     compiler = shutil.which(os.environ.get("CC", "gcc")) or shutil.which("cc")
     header = Path(sysconfig.get_path("include")) / "Python.h"
     if compiler is None:
-        return Check(
-            "compiler", "missing", "no gcc on PATH", "FFCx compiles forms at run time: apt-get install gcc libc6-dev"
-        )
+        return Check("compiler", "missing", "no gcc on PATH", f"{_COMPILER_BRINGS}: apt-get install gcc libc6-dev")
     if not header.exists():
-        return Check("compiler", "missing", f"{compiler}, but no {header}", "apt-get install python3-dev")
+        return Check(
+            "compiler", "missing", f"{compiler}, but no {header}", f"{_COMPILER_BRINGS}: apt-get install python3-dev"
+        )
     return Check("compiler", "ok", f"{compiler}, headers in {header.parent}")
 
 
 def _rendering() -> Check:
     # In a process of its own: a broken OpenGL driver ends the process that asks it.
     command = [sys.executable, "-c", _RENDER]
-    told = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S)
+    try:
+        told = subprocess.run(command, capture_output=True, text=True, timeout=_RENDERING_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return Check("rendering", "warning", f"no picture within {_RENDERING_TIMEOUT_S} s", "try again when it is idle")
     if told.returncode == 0:
         return Check("rendering", "ok", f"off-screen with {told.stdout.split()[-1]}")
     reason = (told.stderr.strip().splitlines() or [f"the probe ended with {told.returncode}"])[-1]
-    return Check("rendering", "missing", reason[:200], "pictures need it: apt-get install libegl1 libgl1 libxcursor1")
+    return Check("rendering", "missing", reason[:200], "pictures without a screen: apt-get install libegl1 libgl1")
 
 
 def _disk() -> Check:
@@ -321,16 +338,22 @@ _CORE: Mapping[str, tuple[Callable[[], Check], str]] = {
     "python": (_python, ""),
     "softtwin": (_softtwin, "pip install --editable . in the repository"),
     "numpy": (_numpy, "pip install numpy"),
-    "torch": (_torch, "surrogates need it: pip install 'softtwin[torch]'"),
+    "torch": (_torch, f"{what_it_brings('torch', 'torch')}: pip install 'softtwin[torch]'"),
 }
 _LOADED = ("scipy", "zarr", "meshio", "gmsh", "pytetwild", "small_gicp")
-_NOT_FOR_USE = ("fenicsx", "benchmark", "test", "dev")  # extras of developers, and FEniCSx, which has lines of its own
-_FENICSX: Mapping[str, Callable[[], Check]] = {
-    "dolfinx": _dolfinx,
-    "ufl": _ufl,
-    "petsc": _petsc,
-    "slepc": _slepc,
-    "mpi": _mpi,
+_NOT_FOR_USE = (
+    "fenicsx",
+    "benchmark",
+    "test",
+    "docs",
+    "dev",
+)  # extras of developers, and FEniCSx, which has lines of its own
+_FENICSX_PARTS: Mapping[str, tuple[Callable[[], Check], str]] = {
+    "dolfinx": (_dolfinx, "spaces and assembly, without which there is no reference: docs/installation.md"),
+    "ufl": (_ufl, "the language of the forms: docs/installation.md"),
+    "petsc": (_petsc, "the reference's solvers: apt-get install python3-petsc4py-real, or by conda petsc4py"),
+    "slepc": (_slepc, "eigenmodes of an organ: apt-get install python3-slepc4py-real, or by conda slepc4py"),
+    "mpi": (_mpi, "many ranks: apt-get install python3-mpi4py, or by conda mpi4py"),
 }
 _MACHINE: Mapping[str, Callable[[], Check]] = {
     "mpirun": _mpirun,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ import click
 from softtwin.reference.ranks import FailedElsewhere
 
 from .doctor import available_cores
+from .installation import launcher
 from .stages.doubt import doubt_stage
 from .stages.generate import generate_stage
 
@@ -51,7 +51,8 @@ def doubt_in_parallel(config_path: Path, ranks: int) -> None:
 def _in_parallel(words: Sequence[str], ranks: int) -> bool:
     """Run a command of softtwin under mpirun; False, and nothing was done, where that is of no use."""
     ranks = ranks or available_cores()
-    if ranks == 1 or shutil.which("mpirun") is None:
+    mpirun = launcher() if ranks > 1 else None
+    if mpirun is None:
         return False
     # A caller that runs MPI itself hands down the names of its own job, which mpirun would take for its.
     environment = {name: value for name, value in os.environ.items() if not name.startswith(_JOB_VARIABLES)}
@@ -61,8 +62,7 @@ def _in_parallel(words: Sequence[str], ranks: int) -> bool:
     if os.geteuid() == 0:
         environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     program = [sys.executable, "-m", "softtwin.app.cli", *words]
-    command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), *program]
-    done = subprocess.run(command, env=environment, check=False)
+    done = subprocess.run(mpirun.command(ranks, program), env=environment, check=False)
     if done.returncode == REFUSED:
         raise FailedElsewhere(f"{words[0]}: refused by the ranks for {words[1]}; their message stands above.")
     if done.returncode != 0:

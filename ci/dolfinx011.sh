@@ -3,18 +3,11 @@
 # found. Argument: where to put pytest's JUnit file.
 set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
+source "$ROOT/ci/way.sh"
 cd "$ROOT"
 SECOND="$ROOT/.venv-011"
 JUNIT=${1:-$ROOT/build/ci/dolfinx-0.11.xml}
 STAMP="$SECOND/.softtwin-stamp"
-
-# The real path of a Python 3.12 (the pins are for it): on PATH, or kept by pyenv, whose shim may point nowhere.
-second_python() {
-    local candidate
-    for candidate in python3.12 "${PYENV_ROOT:-$HOME/.pyenv}"/versions/3.12*/bin/python3.12; do
-        if "$candidate" -c 'import sys, venv; print(sys.executable)' 2>/dev/null; then return; fi
-    done
-}
 
 PYTHON=$(second_python)
 if [ -z "$PYTHON" ]; then

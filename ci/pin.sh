@@ -3,6 +3,7 @@
 # Run it by hand when a dependency is added or is to be renewed; then run ci/test.sh.
 set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
+source "$ROOT/ci/way.sh"
 cd "$ROOT"
 TEMPORARY=$(mktemp -d)
 trap 'rm -rf "$TEMPORARY"' EXIT
@@ -33,8 +34,19 @@ resolve torch,mesh,app,dev,benchmark --system-site-packages
 echo torch-fem==0.14.0 >>"$PINS" # asks for a newer scipy than Debian's: installed without its dependencies
 resolve torch,mesh,app,test
 write ci/constraints.txt "$PINS" 3.11
-if [ -x .venv-011/bin/python ]; then
-    frozen .venv-011/bin/python | sort -f >"$TEMPORARY/second.txt"
-    write ci/constraints-011.txt "$TEMPORARY/second.txt" 3.12
+SECOND_PYTHON=$(second_python)
+if [ -n "$SECOND_PYTHON" ]; then
+    rm -rf "$TEMPORARY/venv"
+    "$SECOND_PYTHON" -m venv "$TEMPORARY/venv"
+    "$TEMPORARY/venv/bin/python" -m pip install -q --dry-run --report "$TEMPORARY/report.json" '.[fenicsx,torch,mesh,app,dev]'
+    # Without the parts of torch's CUDA build: the build for the CPU is to fit the same pins.
+    "$SECOND_PYTHON" - "$TEMPORARY/report.json" >"$TEMPORARY/second.txt" <<'EOF'
+import json, re, sys
+found = (part["metadata"] for part in json.load(open(sys.argv[1]))["install"])
+pins = {part["name"]: part["version"].partition("+")[0] for part in found if part["name"] != "softtwin"}
+kept = {name: version for name, version in pins.items() if not re.match("nvidia-|cuda-|triton$", name)}
+print(*(f"{name}=={kept[name]}" for name in sorted(kept, key=str.lower)), sep="\n")
+EOF
+    write ci/constraints-011.txt "$TEMPORARY/second.txt" "3.12 and 3.13, by way of wheels"
 fi
 rm -rf softtwin.egg-info

@@ -1,12 +1,13 @@
 #!/usr/bin/env bash
-# All set-up, idempotent: system packages (Debian), the virtual environment .venv, the project in it.
+# All set-up, idempotent: FEniCSx on one of the ways of ci/way.sh, the virtual environment .venv, the project in it.
 set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
+source "$ROOT/ci/way.sh"
+source "$ROOT/ci/wheels.sh"
 cd "$ROOT"
 exec 9<"$ROOT"
 flock 9 # two set-ups at once would break each other's virtual environment
 
-EXTRAS=${SOFTTWIN_EXTRAS:-torch,mesh,app,dev}
 PACKAGES=(
     # FEniCSx with PETSc, SLEPc and MPI, and a BLAS that does not make MUMPS 4 times slower
     python3-dolfinx-real python3-petsc4py-real python3-slepc4py-real python3-mpi4py python3-scipy
@@ -47,46 +48,41 @@ install_packages() {
         fail "apt-get could not install: ${wanted[*]}"
 }
 
-check_system_without_apt() {
-    if "$SYSTEM_PYTHON" -c 'import venv, dolfinx, petsc4py, slepc4py, mpi4py' 2>/dev/null; then
-        say "no apt-get here, but $SYSTEM_PYTHON has FEniCSx: going on"
-        return
-    fi
-    fail "no apt-get here, and $SYSTEM_PYTHON has no FEniCSx. Needed, by their names in Debian 12:
-  ${PACKAGES[*]}
-Install them by other means (SOFTTWIN_PYTHON names another interpreter), or take the part without FEniCSx:
-  pip install '.[torch,mesh,app]'   (Python 3.12 and later: '.[torch,mesh,app,fenicsx]' brings FEniCSx too)"
-}
-
-# The pins were resolved for Debian 12's Python; on another one the newest versions that fit are taken.
+# The pins were resolved for two ways; on another Python the newest versions that fit are taken.
 constraints() {
-    if "$SYSTEM_PYTHON" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'; then
-        echo ci/constraints.txt
-    else
-        echo /dev/null
-    fi
+    local version
+    version=$("$SYSTEM_PYTHON" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+    case $WAY-$version in
+        apt-3.11) echo ci/constraints.txt ;;
+        wheels-3.12 | wheels-3.13) echo ci/constraints-011.txt ;;
+        *) echo /dev/null ;;
+    esac
 }
 
 install_project() {
-    local pins stamp="$VENV/.softtwin-stamp" wanted
+    local pins stamp="$VENV/.softtwin-stamp" made="$VENV/.softtwin-way" origin wanted
+    origin="$WAY $("$SYSTEM_PYTHON" -V)"
     pins=$(constraints)
-    [ "$pins" != /dev/null ] || say "virtual environment: ci/constraints.txt is for Python 3.11, taking unpinned versions"
-    wanted=$(fingerprint "$VENV $EXTRAS $("$SYSTEM_PYTHON" -V)" pyproject.toml "$pins")
+    [ "$pins" != /dev/null ] || say "virtual environment: there are no pins for the way $origin, taking the newest versions"
+    wanted=$(fingerprint "$VENV $EXTRAS $origin" pyproject.toml "$pins")
     if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$wanted" ] && "$VENV/bin/python" -c 'import softtwin.meshes' 2>/dev/null; then
         say "virtual environment: .venv is up to date"
         return
     fi
-    # Without its stamp it was cut short, or it was made for another folder: pip cannot be trusted to mend that.
-    if [ ! -f "$stamp" ] || ! grep -qsF "$VENV/bin/python" "$VENV/bin/pip" || ! "$VENV/bin/python" -m pip --version >/dev/null 2>&1; then
+    # Without its stamp it was cut short, or it was made for another folder or way: pip cannot be trusted to mend that.
+    if [ ! -f "$stamp" ] || [ "$(cat "$made" 2>/dev/null)" != "$origin" ] || ! grep -qsF "$VENV/bin/python" "$VENV/bin/pip" || ! "$VENV/bin/python" -m pip --version >/dev/null 2>&1; then
         say "virtual environment: making .venv"
         rm -rf "$VENV"
-        "$SYSTEM_PYTHON" -m venv --system-site-packages "$VENV"
+        "$SYSTEM_PYTHON" -m venv "${VENV_OPTIONS[@]}" "$VENV"
+        echo "$origin" >"$made"
     fi
     rm -f "$stamp"
-    say "virtual environment: installing the project and its pinned dependencies (about 3 minutes the first time)"
+    say "virtual environment: installing the project and its dependencies (some minutes the first time)"
+    if [ "$WAY" = wheels ]; then announce_torch; fi
     "$VENV/bin/python" -m pip install -q -c "$pins" --editable ".[$EXTRAS]" </dev/null
     rm -rf "$ROOT/softtwin.egg-info" # a by-product: seen from this folder, it makes pkg_resources warn
-    "$VENV/bin/python" -c 'import dolfinx, torch, softtwin.meshes' # before the stamp says that all is well
+    # Before the stamp says that all is well; PyPI's DOLFINx wants its solvers first, which this module knows.
+    "$VENV/bin/python" -c 'import torch, softtwin.meshes, softtwin.reference.fem.fenicsx'
     echo "$wanted" >"$stamp"
 }
 
@@ -99,7 +95,26 @@ link_types() {
     done
 }
 
-if command -v apt-get >/dev/null; then install_packages; else check_system_without_apt; fi
+WAY=$(setup_way)
+EXTRAS=${SOFTTWIN_EXTRAS:-torch,mesh,app,dev} # what of the project is installed
+VENV_OPTIONS=(--system-site-packages)
+case $WAY in
+    apt)
+        say "FEniCSx: Debian's packages, by apt"
+        install_packages
+        ;;
+    wheels)
+        SYSTEM_PYTHON=$(wheel_python)
+        EXTRAS=fenicsx,$EXTRAS
+        VENV_OPTIONS=()
+        say "FEniCSx: wheels from PyPI for $SYSTEM_PYTHON"
+        check_machine "$SYSTEM_PYTHON"
+        ;;
+    present)
+        has_fenicsx "$SYSTEM_PYTHON" || fail "SOFTTWIN_PYTHON: $SYSTEM_PYTHON has no FEniCSx"
+        say "FEniCSx: $SYSTEM_PYTHON has it"
+        ;;
+esac
 install_project
 link_types
 say "ready: .venv/bin/softtwin --help"

@@ -132,7 +132,7 @@ def _hidden(surface: Surface, points: Floats, towards: Floats) -> NDArray[np.boo
     starts = points + 1e-6 * size * towards / np.linalg.norm(towards, axis=1, keepdims=True)
     hits, hit = vtkPoints(), np.zeros(len(points), dtype=bool)
     for i, (start, end) in enumerate(zip(starts, points + towards, strict=True)):
-        hit[i] = locator.IntersectWithLine(start, end, hits, None)
+        hit[i] = locator.IntersectWithLine(start, end, 0.0, hits, None)  # with a tolerance: VTK before 9.6 has no other
     return hit
 
 

@@ -22,6 +22,7 @@ from softtwin.app.chain import build_twin
 from softtwin.app.cli import main
 from softtwin.app.config import Config, ConfigError, to_toml
 from softtwin.app.doctor import available_cores
+from softtwin.app.installation import Launcher
 from softtwin.app.stages.learn import train_stage
 from softtwin.app.twin import Twin
 from softtwin.app.workspace import locked, open_workspace, read_records, timed
@@ -333,7 +334,7 @@ def test_ranks_end_together_with_one_message(
 
 def test_ranks_that_refuse_have_said_why(capsys, copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)  # one core starts no ranks
-    monkeypatch.setattr(launch.shutil, "which", lambda name: name)
+    monkeypatch.setattr(launch, "launcher", lambda: Launcher(Path("mpirun"), "MPICH"))
     monkeypatch.setattr(launch.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess([], 2))
     said = run(capsys, "build", copy / "beam.vtu", "--fixed", copy / "fixed.txt", "--output", copy / "new", code=2)
     assert "error" not in said
@@ -348,7 +349,7 @@ def test_ranks_are_the_cores_that_may_be_used(copy: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(launch.os, "sched_getaffinity", lambda _: {1, 4, 5}, raising=False)
     monkeypatch.setattr(launch.os, "cpu_count", lambda: 64)
-    monkeypatch.setattr(launch.shutil, "which", lambda name: name)
+    monkeypatch.setattr(launch, "launcher", lambda: Launcher(Path("mpirun"), "MPICH"))
     monkeypatch.setattr(launch.subprocess, "run", start)
     launch.generate_in_parallel(copy / "organ.toml", 0, again=True)
     assert available_cores() == 3

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from softtwin.app import doctor
+from softtwin.app import doctor, installation
 from softtwin.app.doctor import Check
 
 REFERENCE = "7f00-7f01 r-xp 00000000 fe:00 1  /usr/lib/x86_64-linux-gnu/blas/libblas.so.3.11.0\n"
@@ -52,7 +52,7 @@ def test_a_blas_inside_a_wheel_is_not_petscs() -> None:
     ],
 )
 def test_launchers_are_named_as_mpi4py_names_them(told: str, vendor: str) -> None:
-    assert doctor.launcher_vendor(told) == vendor
+    assert installation.launcher_vendor(told) == vendor
 
 
 def test_text_has_every_check_with_its_advice_and_the_disclaimer_once() -> None:
@@ -76,7 +76,7 @@ def test_every_package_that_softtwin_needs_has_a_line(monkeypatch: pytest.Monkey
     found = {check.name: check for check in doctor.checks()}
     assert {"python", "zarr", "pytetwild", "no-such-thing", "torch", "disk"} <= found.keys() and "pytest" not in found
     assert found["no-such-thing"].status == "missing"
-    assert found["no-such-thing"].advice == "pip install 'softtwin[app]'"
+    assert found["no-such-thing"].advice == "reports, pictures and the live view: pip install 'softtwin[app]'"
 
 
 def test_meshing_has_its_lines() -> None:
