@@ -253,7 +253,7 @@ class Body:
         """Volume of a cell with parallel edges, relative to the triple product of its edges."""
         return {"triangle": 1 / 2, "tetrahedron": 1 / 6}.get(self.kind.shape, 1.0)
 
-    @property
+    @cached_property
     def size(self) -> float:
         """Diagonal of the bounding box, metres."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
