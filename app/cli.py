@@ -556,6 +556,29 @@ def quickstart(output: Path, small: bool) -> None:
     run_quickstart(output, small, click.echo)
 
 
+_PORT = click.option(
+    "--port", type=click.IntRange(1, 65535), help="Of the page; the first free one from 8080 on if not given."
+)
+_BROWSER = click.option(
+    "--browser/--no-browser", default=True, show_default=True, help="Open the page where there is a display."
+)
+
+
+@softtwin.command()
+@_PORT
+@_BROWSER
+@click.option("--record", type=_PATH, help="Record the scene to this HTML file, which plays by itself, and end.")
+@click.option("--seconds", type=click.FloatRange(0.5, 120.0), default=8.0, show_default=True, help="To record.")
+def demo(port: int | None, browser: bool, record: Path | None, seconds: float) -> None:
+    """Show a live page on this machine: a liver phantom before a simulated camera; pull at it with the mouse.
+
+    The twin comes with the package; nothing is made and nothing is downloaded.
+    """
+    from .page.demo import run_demo
+
+    run_demo(port, browser, record, seconds, click.echo)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors of the input are one message and exit code 2, not a traceback."""
     # Ranks are the parallelism: on meshes of an organ's size several BLAS threads in one process only wait for another.
