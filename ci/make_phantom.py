@@ -49,8 +49,8 @@ CONFIG = {
     "folder": ".",
     "body": {"source": "liver-phantom", "cell_size": 0.016},
     "loads": {"displacement": 0.03, "patches": 2, "radius": (0.15, 0.5)},
-    "samples": {"train": 192, "validation": 16, "test": 32, "calibration": 40, "block": 8, "ranks": 1},
-    "training": {"epochs": 300, "modes": 16, "width": 48},
+    "samples": {"train": 256, "validation": 16, "test": 32, "calibration": 40, "block": 8, "ranks": 1},
+    "training": {"epochs": 2000, "modes": 16, "width": 48},
     "doubt": {"draws": 0},
 }
 

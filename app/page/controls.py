@@ -15,6 +15,7 @@ from .bands import SCALES
 from .camera import View
 from .figures import Figures, figures_html, legend_html, notice_html
 
+RECORDED_S = 8.0
 ENGINES = ("surrogate", "hybrid", "reference")
 _SHOWS = {
     "true error": "error",
@@ -93,8 +94,9 @@ class Controls:
             inputs += [*self._sliders, self._runs]
         for handle in inputs:
             handle.on_update(self._on_update)
+        self._record = gui.add_button(f"record {RECORDED_S:g} s as one HTML file", hint="The scene, without this panel")
         self.show(Figures("softtwin", reason="the twin is being opened"))
-        self._describe()
+        self.describe(self.wishes.shows)
 
     @property
     def wishes(self) -> Wishes:
@@ -106,14 +108,22 @@ class Controls:
             runs = bool(self._runs.value)
         return Wishes(view, str(self._engine.value), _SHOWS[str(self._shows.value)], runs)
 
+    def on_record(self, callback: Callable[[viser.ClientHandle], None]) -> None:
+        """Call with the browser in which a recording was asked for."""
+        self._record.on_click(lambda event: callback(event.client) if event.client is not None else None)
+
     def show(self, figures: Figures) -> None:
         """Show figures."""
         self._figures.content = figures_html(figures)
 
     def _on_update(self, _: Any) -> None:
-        self._describe()
+        self.describe(self.wishes.shows)
         self._changed()
 
-    def _describe(self) -> None:
-        shows = self.wishes.shows
+    def describe(self, shows: str) -> None:
+        """Say what the colours mean.
+
+        Args:
+            shows: a word of `SCALES`.
+        """
         self._legend.content = legend_html(SCALES[shows], shows == "distance")

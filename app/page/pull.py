@@ -1,8 +1,9 @@
-"""A pull at the organ: the force on a patch under which the network says that the patch follows the mouse."""
+"""A pull at the organ: the most usual load about a place under which the network says that it follows the mouse."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,9 @@ from ..twin import Twin
 
 Floats = NDArray[np.float64]
 
-_RADIUS = 0.13  # of the patch, relative to the body's size
+_GRIP, _REACH = 0.1, 0.4  # radii of what follows the mouse and of where the load acts, relative to the body's size
 _FARTHEST = 1.5  # times the largest calibrated displacement: beyond it the patch no longer follows
-_STRONGEST = 0.025  # newtons for each pascal of Young's modulus and square metre of size
+_EXTENT = 1.3  # times as far out as any load of the training: beyond it the network's state is of no use to look at
 _STEPS = 2  # of Newton's method for each place of the mouse: the network is smooth and the mouse moves little
 
 
@@ -63,44 +64,85 @@ class Pull:
 
     def __init__(self, twin: Twin, held: Floats, displacement: Floats, forces: Floats) -> None:
         self._twin, self._before = twin, forces
-        self._weights = patch(twin, held, displacement)
-        self._rest = self._weights @ twin.predict(forces).displacement
-        body, modulus = twin.body, twin.config.material.young_modulus
-        self._strongest = _STRONGEST * modulus * body.size**2
+        self._weights = patch(twin, held, displacement, _GRIP)
+        state = twin.predict(forces)
+        self._rest = self._weights @ state.displacement
+        self._basis = usual_loads(twin, held, displacement, _moved_by(state, self._weights))
         self._farthest = _FARTHEST * farthest(twin)
-        self._force: Floats = np.zeros(3)
+        self._amounts: Floats = np.zeros(3)
 
     def to(self, place: Place) -> Prediction:
         """The prediction for a place of the mouse."""
-        wanted = _within(place.shift, self._farthest)
+        wanted = self._rest + _within(place.shift, self._farthest)
+        state: Any = self._twin.predict(self._forces(self._amounts))
         for _ in range(_STEPS):
-            state = self._twin.predict(self._forces)
-            missing = self._rest + wanted - self._weights @ state.displacement
-            columns = np.kron(self._weights[:, None], np.eye(3))
-            compliance = np.einsum("n,nij->ij", self._weights, state.push(columns).reshape(-1, 3, 3))
-            step = np.linalg.lstsq(compliance, missing, rcond=1e-6)[0]
-            self._force = _within(self._force + step, self._strongest)
-        forces = self._forces
-        state = self._twin.predict(forces)
-        certificate = self._twin.certify(forces, state) if is_calibrated(self._twin) else None  # type: ignore[arg-type]
-        return Prediction(state.displacement, forces, self._force, certificate, place.at)
+            missing = wanted - self._weights @ state.displacement
+            compliance = _moved_by(state, self._weights).reshape(3, -1) @ self._basis.reshape(-1, 3)
+            state = self._advance(np.linalg.lstsq(compliance, missing, rcond=1e-6)[0], state)
+        forces = self._forces(self._amounts)
+        certificate = self._twin.certify(forces, state) if is_calibrated(self._twin) else None
+        pull = (self._basis @ self._amounts).sum(axis=0)
+        return Prediction(state.displacement, forces, pull, certificate, place.at)
 
-    @property
-    def _forces(self) -> Floats:
-        return self._before + self._weights[:, None] * self._force
+    def _advance(self, step: Floats, state: Any) -> Any:
+        """The state after as much of a step as leaves the load where the network says something; moves there."""
+        for part in (1.0, 0.5, 0.25, 0.1):
+            amounts = self._amounts + part * step
+            reached: Any = self._twin.predict(self._forces(amounts))
+            extent = reached.extent
+            if extent is None or extent <= _EXTENT or extent <= state.extent:
+                self._amounts = amounts
+                return reached
+        return state
+
+    def _forces(self, amounts: Floats) -> Floats:
+        return self._before + self._basis @ amounts
 
 
-def patch(twin: Twin, held: Floats, displacement: Floats) -> Floats:
-    """Shares of a force on the nodes about a place, (n,), that sum to one: of those alone that may carry load.
+def usual_loads(twin: Twin, held: Floats, displacement: Floats, response: Floats) -> Floats:
+    """Three loads on the nodes about a place, (n, 3, 3), newtons: the most usual ones that move it along each axis.
+
+    Usual is what the training loads were like on these nodes: of all loads that move the place by as much, these have
+    the least Mahalanobis length, which is what the certificate asks of a load. They are as long as they are usual.
 
     Args:
         twin: with a network.
         held: the place, (3,), metres, on the moved organ.
         displacement: nodal, (n, 3), metres.
+        response: gradient of the place's movement by the forces, (3, n, 3), metres a newton.
+    """
+    maps = twin.model.maps  # type: ignore[attr-defined]
+    near = (patch(twin, held, displacement, _REACH) > 0.0)[maps.loaded]
+    rows = np.repeat(near, 3)
+    gradient = response[:, maps.loaded].reshape(3, -1)[:, rows]
+    loads = gradient.T
+    if maps.load_modes is not None and maps.load_rest is not None:
+        modes = maps.load_modes[rows]
+        loads = modes @ (modes.T @ gradient.T) + float(maps.load_rest[0]) * gradient.T
+    basis = np.zeros((len(maps.loaded) * 3, 3))
+    basis[rows] = loads / max(float(np.linalg.norm(loads, axis=0).max()), 1e-300)
+    whole = np.zeros((len(twin.body.points), 3, 3))
+    whole[maps.loaded] = basis.reshape(-1, 3, 3)
+    return whole
+
+
+def _moved_by(state: Any, weights: Floats) -> Floats:
+    """Gradient of the weighted displacement by the nodal forces, (3, n, 3), metres a newton."""
+    return np.stack([state.pull(np.outer(weights, axis)) for axis in np.eye(3)])
+
+
+def patch(twin: Twin, held: Floats, displacement: Floats, relative: float) -> Floats:
+    """Shares of the nodes about a place, (n,), that sum to one: of those alone that may carry load.
+
+    Args:
+        twin: with a network.
+        held: the place, (3,), metres, on the moved organ.
+        displacement: nodal, (n, 3), metres.
+        relative: radius of the patch, relative to the body's size.
     """
     body, loaded = twin.body, twin.model.maps.loaded  # type: ignore[attr-defined]
     away = np.linalg.norm(body.points[loaded] + displacement[loaded] - held, axis=1)
-    radius = max(_RADIUS * body.size, 1.5 * float(away.min()))
+    radius = max(relative * body.size, 1.5 * float(away.min()))
     shares = np.zeros(len(body.points))
     shares[loaded] = np.square(np.maximum(1.0 - np.square(away / radius), 0.0))
     return shares / shares.sum()

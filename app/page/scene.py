@@ -21,7 +21,7 @@ Drag = Callable[[Any], Coroutine[Any, Any, None]]
 
 PER_METRE = 10.0  # the scene is in decimetres: what viser takes for granted is about as large as one
 FRONT = np.array([-0.3, -1.0, 0.25])  # from an organ towards who looks at it, as from the patient's front
-_ORGAN_OPACITY = 0.42
+_ORGAN_OPACITY = 0.45
 _NOWHERE = np.zeros((1, 3), dtype=np.int64)  # a triangle of no area: viser's meshes are never empty
 _KINDS: tuple[tuple[str, Colour], ...] = (
     ("tumour", (110, 30, 140)),
@@ -53,7 +53,7 @@ class Picture:
         cloud_size: diameter of a point of the cloud, metres.
     """
 
-    def __init__(self, server: viser.ViserServer, body: Body, cloud_size: float = 1.5e-3) -> None:
+    def __init__(self, server: viser.ViserServer, body: Body, cloud_size: float = 1.1e-3) -> None:
         self._server, self._lock = server, threading.RLock()
         self._outer = outer(body)
         self._shown = self._outer.vertices
@@ -153,7 +153,7 @@ class Picture:
         scene, camera = self._server.scene, self._server.initial_camera
         points = self._outer.rest.points[self._shown]
         size = PER_METRE * float(np.linalg.norm(np.ptp(points, axis=0)))
-        place = 0.9 * size * FRONT / np.linalg.norm(FRONT)
+        place = 0.78 * size * FRONT / np.linalg.norm(FRONT)
         camera.position, camera.look_at = place, (0.0, 0.0, 0.0)
         camera.up = (0.0, 0.0, 1.0)
         scene.set_up_direction("+z")

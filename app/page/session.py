@@ -24,7 +24,7 @@ from ..twin import Camera, Frame, Home, Sequence, Twin
 from .bands import SCALES
 from .brush import Brush
 from .camera import Shot
-from .controls import Controls, Wishes, engines_here
+from .controls import RECORDED_S, Controls, Wishes, engines_here
 from .figures import Figures
 from .hand import Hand
 from .pull import Prediction
@@ -72,6 +72,7 @@ class Session:
         self.hand = Hand(home, self.brush, self._show_prediction, self._let_go) if has_network else None
         if self.hand is not None:
             self.picture.on_drag(self._on_drag)
+        self.controls.on_record(self._record_for)
         server.on_client_connect(self._on_come)
         server.on_client_disconnect(self._on_go)
 
@@ -230,7 +231,8 @@ class Session:
         else:
             verdict, reason = Verdict.DOUBTFUL, next(iter(certificate.reasons), "nothing can be said of it")
         self.picture.show_cloud(None)
-        self.picture.paint(None, SCALES["error"])
+        self.controls.describe("movement")
+        self.picture.paint(np.linalg.norm(found.displacement, axis=1), SCALES["movement"])
         self.picture.name_margins({})
         self.controls.show(
             Figures(
@@ -247,6 +249,7 @@ class Session:
         )
 
     def _let_go(self) -> None:
+        self.controls.describe(self.wishes.shows)
         self._on_change()
 
     # What happens in a browser.
@@ -281,6 +284,9 @@ class Session:
             if self._recording is None:
                 self._recording = Recording(self._server, seconds, self._recorded(done))
         self._on_change()
+
+    def _record_for(self, client: viser.ClientHandle) -> None:
+        self.record(RECORDED_S, lambda page: client.send_file_download("softtwin.html", page.encode()))
 
     def _recorded(self, done: Callable[[str], None]) -> Callable[[str], None]:
         def end(page: str) -> None:
