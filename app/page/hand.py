@@ -83,7 +83,7 @@ class Hand:
         with self._news:
             self._is_closed = True
             self._news.notify()
-        self._thread.join(timeout=5.0)
+        self._thread.join(timeout=60.0)  # a thread that is at work when Python ends takes the process down with it
 
     def _run(self) -> None:
         with self._home.twin("surrogate") as twin:

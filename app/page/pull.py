@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from softtwin.registration.verdict import Verdict
 from softtwin.surrogate.certificate import Certificate
 
 from ..twin import Twin
@@ -17,6 +18,8 @@ Floats = NDArray[np.float64]
 _GRIP, _REACH = 0.1, 0.4  # radii of what follows the mouse and of where the load acts, relative to the body's size
 _FARTHEST = 1.5  # times the largest calibrated displacement: beyond it the patch no longer follows
 _EXTENT = 1.3  # times as far out as any load of the training: beyond it the network's state is of no use to look at
+_WORTHLESS = 0.02  # of the body's size: where the largest error may be more, a state is not worth a look
+_PARTS = (1.0, 0.5, 0.25)  # of the way to the mouse that are tried, until the prediction is worth something
 _STEPS = 2  # of Newton's method for each place of the mouse: the network is smooth and the mouse moves little
 
 
@@ -30,6 +33,7 @@ class Prediction:
         pull: net force of the pull, (3,), newtons.
         certificate: how wrong the displacement may be; None where the network was never calibrated.
         asked: when the mouse was there, seconds of the monotonic clock.
+        is_held: whether the mouse is farther away than the organ could follow it.
     """
 
     displacement: Floats
@@ -37,6 +41,7 @@ class Prediction:
     pull: Floats
     certificate: Certificate | None
     asked: float
+    is_held: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,20 +74,39 @@ class Pull:
         self._rest = self._weights @ state.displacement
         self._basis = usual_loads(twin, held, displacement, _moved_by(state, self._weights))
         self._farthest = _FARTHEST * farthest(twin)
+        self._limit = _WORTHLESS * twin.body.size
         self._amounts: Floats = np.zeros(3)
+        self._last: Prediction | None = None
+        self._reached = self._rest
 
     def to(self, place: Place) -> Prediction:
-        """The prediction for a place of the mouse."""
+        """The prediction for a place of the mouse; where it would be worth nothing, the last one, which is said."""
         wanted = self._rest + _within(place.shift, self._farthest)
+        for part in _PARTS if self._last is not None else (1.0,):
+            before = self._amounts
+            found = self._prediction(self._towards(self._reached + part * (wanted - self._reached)), place.at)
+            bound = 0.0 if found.certificate is None else found.certificate.largest
+            if bound <= self._limit or self._last is None:
+                self._last = replace(found, is_held=part < 1.0)
+                self._reached = self._weights @ found.displacement
+                return self._last
+            self._amounts = before
+        assert self._last is not None
+        return replace(self._last, is_held=True, asked=place.at)
+
+    def _towards(self, wanted: Floats) -> Any:
+        """The state under amounts by which the place is where it is wanted, or nearer to it."""
         state: Any = self._twin.predict(self._forces(self._amounts))
         for _ in range(_STEPS):
             missing = wanted - self._weights @ state.displacement
             compliance = _moved_by(state, self._weights).reshape(3, -1) @ self._basis.reshape(-1, 3)
             state = self._advance(np.linalg.lstsq(compliance, missing, rcond=1e-6)[0], state)
+        return state
+
+    def _prediction(self, state: Any, asked: float) -> Prediction:
         forces = self._forces(self._amounts)
         certificate = self._twin.certify(forces, state) if is_calibrated(self._twin) else None
-        pull = (self._basis @ self._amounts).sum(axis=0)
-        return Prediction(state.displacement, forces, pull, certificate, place.at)
+        return Prediction(state.displacement, forces, (self._basis @ self._amounts).sum(axis=0), certificate, asked)
 
     def _advance(self, step: Floats, state: Any) -> Any:
         """The state after as much of a step as leaves the load where the network says something; moves there."""
@@ -97,6 +121,18 @@ class Pull:
 
     def _forces(self, amounts: Floats) -> Floats:
         return self._before + self._basis @ amounts
+
+
+def judged(found: Prediction) -> tuple[Verdict, str]:
+    """The verdict on a prediction by its certificate, and why it is not accepted."""
+    certificate = found.certificate
+    if certificate is None:
+        return Verdict.DOUBTFUL, "no certificate: this twin was never calibrated"
+    if found.is_held:
+        return Verdict.DOUBTFUL, "it follows no farther: what the network says beyond this pull is worth nothing"
+    if certificate.is_inside and np.isfinite(certificate.largest):
+        return Verdict.ACCEPTED, ""
+    return Verdict.DOUBTFUL, next(iter(certificate.reasons), "nothing can be said of its error")
 
 
 def usual_loads(twin: Twin, held: Floats, displacement: Floats, response: Floats) -> Floats:

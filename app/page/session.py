@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registration
-from softtwin.registration.verdict import Verdict
 
 from ..register import registered
 from ..streams import Arrival, Mailbox, fed
@@ -27,7 +26,7 @@ from .camera import Shot
 from .controls import RECORDED_S, Controls, Wishes, engines_here
 from .figures import Figures
 from .hand import Hand
-from .pull import Prediction
+from .pull import Prediction, judged
 from .recording import Recording
 from .scene import Picture
 from .values import errors_of, margins_of, shown_values
@@ -223,13 +222,7 @@ class Session:
             self.hand.let_go(event.client_id)
 
     def _show_prediction(self, found: Prediction) -> None:
-        certificate = found.certificate
-        if certificate is None:
-            verdict, reason = Verdict.DOUBTFUL, "no certificate: this twin was never calibrated"
-        elif certificate.is_inside and np.isfinite(certificate.largest):
-            verdict, reason = Verdict.ACCEPTED, ""
-        else:
-            verdict, reason = Verdict.DOUBTFUL, next(iter(certificate.reasons), "nothing can be said of it")
+        certificate, (verdict, reason) = found.certificate, judged(found)
         self.picture.show_cloud(None)
         self.controls.describe("movement")
         self.picture.paint(np.linalg.norm(found.displacement, axis=1), SCALES["movement"])

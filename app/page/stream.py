@@ -1,4 +1,4 @@
-"""`softtwin live`: a twin before a real camera; its clouds come from a folder, a Python iterator, or what joins here."""
+"""`softtwin live`: a twin before a real camera; clouds come from a folder, a Python iterator, or what joins here."""
 
 from __future__ import annotations
 
