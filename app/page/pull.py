@@ -20,6 +20,7 @@ _FARTHEST = 1.5  # times the largest calibrated displacement: beyond it the patc
 _EXTENT = 1.3  # times as far out as any load of the training: beyond it the network's state is of no use to look at
 _WORTHLESS = 0.02  # of the body's size: where the largest error may be more, a state is not worth a look
 _PARTS = (1.0, 0.5, 0.25)  # of the way to the mouse that are tried, until the prediction is worth something
+_LEFT, _LEAST_LEFT = 0.2, 1e-3  # of the way, and metres, that a place may lag behind the mouse and still follow it
 _STEPS = 2  # of Newton's method for each place of the mouse: the network is smooth and the mouse moves little
 
 
@@ -87,12 +88,16 @@ class Pull:
             found = self._prediction(self._towards(self._reached + part * (wanted - self._reached)), place.at)
             bound = 0.0 if found.certificate is None else found.certificate.largest
             if bound <= self._limit or self._last is None:
-                self._last = replace(found, is_held=part < 1.0)
+                self._last = found
                 self._reached = self._weights @ found.displacement
-                return self._last
+                break
             self._amounts = before
         assert self._last is not None
-        return replace(self._last, is_held=True, asked=place.at)
+        return replace(self._last, is_held=self._is_held(place), asked=place.at)
+
+    def _is_held(self, place: Place) -> bool:
+        left = np.linalg.norm(self._rest + place.shift - self._reached)
+        return bool(left > _LEFT * np.linalg.norm(place.shift) + _LEAST_LEFT)
 
     def _towards(self, wanted: Floats) -> Any:
         """The state under amounts by which the place is where it is wanted, or nearer to it."""
