@@ -4,14 +4,13 @@ python benchmarks/live_page.py                 600 seconds of the demo in headle
 python benchmarks/live_page.py --seconds 60    a shorter look
 
 Software rendering draws three to twelve pictures a second, so that what is counted is what the browser receives:
-messages on its websocket that move the organ's vertices, with Chromium's own times. A pull is timed from the message
-with the mouse's place, which the library sends at most every 50 ms, to the next one that moves the organ.
+messages on its websocket that move the organ's vertices. A pull is timed from the message with the mouse's place, which
+the library sends at most every 50 ms, to the next one that moves the organ, both as Playwright tells of them.
 """
 
 from __future__ import annotations
 
 import argparse
-import base64
 import json
 import os
 import signal
@@ -58,7 +57,7 @@ class Heard:
     """What went over the websocket of one page.
 
     Args:
-        updates: when the organ was moved, seconds of Chromium's monotonic clock.
+        updates: when the organ was moved, seconds of the monotonic clock.
         drags: when the mouse's place was sent, likewise.
         received: bytes.
     """
@@ -67,18 +66,17 @@ class Heard:
     drags: list[float] = field(default_factory=list)
     received: int = 0
 
-    def take(self, event: dict[str, Any]) -> None:
+    def take(self, payload: str | bytes) -> None:
         """A frame that came."""
-        payload = base64.b64decode(event["response"]["payloadData"])
+        assert isinstance(payload, bytes)
         self.received += len(payload)
         if moves_organ(payload):
-            self.updates.append(event["timestamp"])
+            self.updates.append(time.monotonic())
 
-    def give(self, event: dict[str, Any]) -> None:
+    def give(self, payload: str | bytes) -> None:
         """A frame that was sent."""
-        message = msgspec.msgpack.decode(base64.b64decode(event["response"]["payloadData"]))
-        if "Drag" in message["type"]:
-            self.drags.append(event["timestamp"])
+        if "Drag" in msgspec.msgpack.decode(payload)["type"]:
+            self.drags.append(time.monotonic())
 
     def answers(self) -> list[float]:
         """Seconds from each place of the mouse to the organ's next movement."""
@@ -120,10 +118,7 @@ main(sys.argv[1:])
 def opened(browser: Browser, address: str) -> tuple[Page, Heard]:
     """A page with the demo in it, and what it hears."""
     page, heard = browser.new_page(viewport=VIEW), Heard()
-    wire = page.context.new_cdp_session(page)
-    wire.send("Network.enable")
-    wire.on("Network.webSocketFrameReceived", heard.take)
-    wire.on("Network.webSocketFrameSent", heard.give)
+    page.on("websocket", lambda wire: (wire.on("framereceived", heard.take), wire.on("framesent", heard.give)))
     page.goto(f"http://{address}", timeout=120_000)
     page.wait_for_selector("canvas", timeout=120_000)
     return page, heard

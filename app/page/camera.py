@@ -124,4 +124,4 @@ def pose_of(view: View, body: Body) -> Pose:
 def _part(cloud: Floats, share: float) -> Floats:
     """The points on one side of what is seen, as an instrument or a fold hides the others."""
     count = min(len(cloud), max(_LEAST, round(share * len(cloud))))
-    return cloud[np.argsort(cloud @ _SIDEWAYS)[:count]]
+    return cloud[np.sort(np.argsort(cloud @ _SIDEWAYS)[:count])]

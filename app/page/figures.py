@@ -33,7 +33,6 @@ class Figures:
         net_force: size of the net force.
         net_force_deviation: its standard deviation.
         true_net_force: its true size.
-        noise: of the cloud's points, as found.
         frame_time: from a cloud's turn to its answer.
         age: from a cloud's coming to its answer.
         dropped: clouds that came and were never registered, in all.
@@ -51,7 +50,6 @@ class Figures:
     net_force: float = np.nan
     net_force_deviation: float = np.nan
     true_net_force: float = np.nan
-    noise: float = np.nan
     frame_time: float = np.nan
     age: float = np.nan
     dropped: int = 0
@@ -131,8 +129,6 @@ def _others(figures: Figures) -> str:
         rows.append(("net force", f"{figures.net_force:.2f}{doubt} N"))
     if np.isfinite(figures.true_net_force):
         rows.append(("true net force", f"{figures.true_net_force:.2f} N"))
-    if np.isfinite(figures.noise):
-        rows.append(("noise found", _mm(figures.noise, 2)))
     for name, seconds in (("frame time", figures.frame_time), ("age of the answer", figures.age)):
         if np.isfinite(seconds):
             rows.append((name, f"{1e3 * seconds:.0f} ms"))
@@ -154,5 +150,5 @@ def _chip(colour: Colour, words: str) -> str:
     return f'<div style="font-size:15px;line-height:1.5"><span style="{box}"></span>{escape(words)}</div>'
 
 
-def _mm(metres: float | None, digits: int = 1) -> str:
-    return f"{1e3 * metres:.{digits}f} mm" if metres is not None and np.isfinite(metres) else "unknown"
+def _mm(metres: float | None) -> str:
+    return f"{1e3 * metres:.1f} mm" if metres is not None and np.isfinite(metres) else "unknown"

@@ -53,7 +53,7 @@ class Picture:
         cloud_size: diameter of a point of the cloud, metres.
     """
 
-    def __init__(self, server: viser.ViserServer, body: Body, cloud_size: float = 1.1e-3) -> None:
+    def __init__(self, server: viser.ViserServer, body: Body, cloud_size: float = 0.8e-3) -> None:
         self._server, self._lock = server, threading.RLock()
         self._outer = outer(body)
         self._shown = self._outer.vertices

@@ -194,7 +194,6 @@ class Session:
             reason=reason,
             margins=margins,
             errors=errors,
-            noise=found.noise,
             net_force=float(np.linalg.norm(found.net_force)),
             net_force_deviation=float(np.linalg.norm(found.net_force_deviation)),
             true_net_force=np.nan if shot.net_force is None else float(np.linalg.norm(shot.net_force)),
