@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-EVERY = 1.0 / 40.0  # seconds between two steps
+EVERY = 1.0 / 45.0  # seconds between two steps
+_LONGER = 1.25  # times the time between two answers: the next one comes before the picture stands still
 _LONGEST = 0.4  # seconds that a glide takes at most: slower engines are not to look smooth
 _REST = 1e-5  # metres that nobody sees
 
@@ -45,7 +46,7 @@ class Brush:
         """Go to an answer in about the time that lay between it and the one before."""
         with self._news:
             now = time.monotonic()
-            self._span = min(now - self._asked, _LONGEST)
+            self._span = min(_LONGER * (now - self._asked), _LONGEST)
             self._asked = self._begin = now
             self._from, self._to = self._shown, displacement
             self._news.notify()
@@ -65,13 +66,16 @@ class Brush:
         self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
+        due = 0.0
         while True:
             with self._news:
                 self._news.wait_for(lambda: self._is_closed or self._shown is not self._to)
                 if self._is_closed:
                     return
-                self._step(time.monotonic())
-            time.sleep(EVERY)
+                now = time.monotonic()
+                self._step(now)
+            due = max(due + EVERY, now)  # a step that was late does not make the next one late
+            time.sleep(max(0.0, due - time.monotonic()))
 
     def _step(self, now: float) -> None:
         part = 1.0 if self._span <= 0.0 else min(1.0, (now - self._begin + EVERY) / self._span)
