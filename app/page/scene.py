@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import outer, target_points
 
+from ..record import NOTICE
 from .bands import COLOURS, UNTOLD, Colour, Scale, banded
 
 Floats = NDArray[np.float64]
@@ -157,6 +158,8 @@ class Picture:
         camera.position, camera.look_at = place, (0.0, 0.0, 0.0)
         camera.up = (0.0, 0.0, 1.0)
         scene.set_up_direction("+z")
+        # In the scene, too: a recording has no panel.
+        scene.add_label("/notice", NOTICE, position=(0.0, 0.0, -0.45 * size), anchor="top-center")
         scene.configure_default_lights(enabled=True, cast_shadow=False)
 
     def _band(self, number: int, rest: NDArray[np.float32], colour: Colour) -> viser.MeshHandle:
