@@ -619,6 +619,98 @@ def quickstart(output: Path, small: bool) -> None:
     run_quickstart(output, small, click.echo)
 
 
+_PORT = click.option(
+    "--port", type=click.IntRange(1, 65535), help="Of the page; the first free one from 8080 on if not given."
+)
+_BROWSER = click.option(
+    "--browser/--no-browser", default=True, show_default=True, help="Open the page where there is a display."
+)
+
+
+@softtwin.command()
+@_PORT
+@_BROWSER
+@click.option("--record", type=_PATH, help="Record the scene to this HTML file, which plays by itself, and end.")
+@click.option("--seconds", type=click.FloatRange(0.5, 120.0), default=8.0, show_default=True, help="To record.")
+def demo(port: int | None, browser: bool, record: Path | None, seconds: float) -> None:
+    """Show a live page on this machine: a liver phantom before a simulated camera; pull at it with the mouse.
+
+    The twin comes with the package; nothing is made and nothing is downloaded.
+    """
+    from .page.demo import run_demo
+
+    run_demo(port, browser, record, seconds, click.echo)
+
+
+@softtwin.command()
+@click.argument("twin", type=_EXISTING)
+@click.argument("source")
+@click.option(
+    "--model",
+    "--engine",
+    "model",
+    type=click.Choice(["surrogate", "reference", "hybrid"]),
+    help="Forward model to begin with; the page can change it.",
+)
+@click.option("--zone", help="Node set whose nodes may carry force; '' for all loaded nodes.")
+@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
+@click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")
+@click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
+@click.option("--align", type=click.Choice(["auto"]), help="Look for the pose in the first cloud that shows it.")
+@click.option("--idle", type=float, help="End after so many seconds without a new cloud.")
+@_PORT
+@_BROWSER
+def live(
+    twin: Path,
+    source: str,
+    unit: Unit | None,
+    matrix: Path | None,
+    landmarks: tuple[Path, Path] | None,
+    align: str | None,
+    idle: float | None,
+    port: int | None,
+    browser: bool,
+    **chosen: Any,
+) -> None:
+    """Show a live page on this machine: TWIN follows the clouds of SOURCE, a folder that is written to.
+
+    Nothing is written; `softtwin register --watch` keeps the results.
+    """
+    from .page.stream import run_live
+    from .register import Start
+
+    if sum(given is not None for given in (matrix, landmarks or None, align)) > 1:
+        raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
+    start = Start(matrix, landmarks or None, align is not None)
+    run_live(
+        twin, source, _given(chosen), unit=unit, start=start, idle=idle, port=port, browser=browser, say=click.echo
+    )
+
+
+@softtwin.command()
+@click.argument("organ", type=_PATH)
+@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the files.")
+@click.option("--frame", type=click.Choice(["lps", "ras"], case_sensitive=False), help="Axes of files that say none.")
+@click.option("--inner", multiple=True, metavar="NAME=FILE", help="A vessel or tumour surface to show along.")
+@_PORT
+@_BROWSER
+def pick(organ: Path, unit: Unit, frame: str | None, inner: tuple[str, ...], port: int | None, browser: bool) -> None:
+    """Show a page on which one clicks what holds ORGAN, and get the words for --fixed.
+
+    ORGAN is a surface or a mesh, or a configuration (organ.toml), which the words can be written into.
+    """
+    from .config import read_config
+    from .page.pick import run_pick
+
+    if organ.suffix == ".toml":
+        known, root = read_config(organ)
+        run_pick(known.body, root, organ, port, browser, click.echo)
+        return
+    body = {"source": _with_axes(_resolved(str(organ))), "unit": unit, "frame": frame or ""}
+    section = parse_config({"body": {**body, "inner": _named("--inner", inner)}}, "command line").body
+    run_pick(section, Path(), None, port, browser, click.echo)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; errors of the input are one message and exit code 2, not a traceback."""
     # Ranks are the parallelism: on meshes of an organ's size several BLAS threads in one process only wait for another.

@@ -10,7 +10,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 FOLDERS = ("meshes", "reference", "surrogate", "registration", "app")
-SUFFIXES = {".py", ".html", ".toml"}
+SUFFIXES = {".py", ".html", ".toml", ".vtu", ".json", ".safetensors", ".npz"}
 
 
 def expected(root: Path) -> set[str]:

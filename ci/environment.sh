@@ -21,3 +21,7 @@ fingerprint() {
     shift
     { printf '%s\n' "$folder"; cat "$@"; } | sha256sum | cut -d' ' -f1
 }
+
+as_root() {
+    if [ "$(id -u)" = 0 ]; then env DEBIAN_FRONTEND=noninteractive "$@"; else sudo env DEBIAN_FRONTEND=noninteractive "$@"; fi
+}

@@ -25,10 +25,6 @@ missing_packages() {
     comm -23 <(printf '%s\n' "${PACKAGES[@]}" | sort) <(printf '%s\n' "$installed" | sort)
 }
 
-as_root() {
-    if [ "$(id -u)" = 0 ]; then env DEBIAN_FRONTEND=noninteractive "$@"; else sudo env DEBIAN_FRONTEND=noninteractive "$@"; fi
-}
-
 install_packages() {
     local wanted
     mapfile -t wanted < <(missing_packages)

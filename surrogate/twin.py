@@ -35,27 +35,36 @@ class TwinError(ValueError):
     """A twin that cannot be used: missing, truncated, changed, or of another body."""
 
 
-def save(surrogate: Surrogate, folder: Path | str) -> None:
+def save(surrogate: Surrogate, folder: Path | str, single: bool = False) -> None:
     """Write weights (safetensors) and card (JSON) into a folder; the body is written apart, with `meshes.files`.
 
     Args:
         surrogate: what to save.
         folder: made if it is not there; files of the same names are replaced.
+        single: round all numbers to single precision, for half of the size; `load` gives them back in double.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     tensors = {f"{_MAPS}{name}": array for name, array in surrogate.maps.arrays().items()}
     tensors |= {f"{_NETWORK}{name}": tensor.numpy() for name, tensor in surrogate.network.state_dict().items()}
+    if single:
+        tensors = {name: _as(array, np.float64, np.float32) for name, array in tensors.items()}
     weights = save_tensors({name: np.ascontiguousarray(array) for name, array in tensors.items()})
     card = {
-        **surrogate.card,
+        **{name: entry for name, entry in surrogate.card.items() if name != "stored"},
         "format": FORMAT,
         "body": surrogate.body.fingerprint,
         "weights": hashlib.sha256(weights).hexdigest(),
+        **({"stored": "single"} if single else {}),
         "notice": NOTICE,
     }
     _replace(folder / WEIGHTS, weights)
     _replace(folder / CARD, json.dumps(card, indent=2, allow_nan=False).encode())
+
+
+def _as(array: NDArray[Any], kind: type[np.number[Any]], wanted: type[np.number[Any]]) -> NDArray[Any]:
+    """An array of one kind as another; others as they are."""
+    return array.astype(wanted) if array.dtype == kind else array
 
 
 def _replace(path: Path, content: bytes) -> None:
@@ -82,6 +91,8 @@ def load(folder: Path | str, body: Body) -> Surrogate:
             f"got {body.fingerprint[:12]}...); nodes, cells and fixed nodes must be those it was trained on."
         )
     tensors = _read_weights(folder / WEIGHTS, card["weights"])
+    if card.get("stored") == "single":
+        tensors = {name: _as(array, np.float32, np.float64) for name, array in tensors.items()}
     maps: dict[str, Any] = {
         name.removeprefix(prefix): array
         for name, array in tensors.items()

@@ -1,0 +1,1 @@
+"""The live page: what a browser on this machine shows of a twin."""

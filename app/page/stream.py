@@ -1,0 +1,121 @@
+"""`softtwin live`: a twin before a real camera; clouds come from a folder, a Python iterator, or what joins here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from softtwin.meshes.files import Unit
+
+from ..config import ConfigError
+from ..record import NOTICE
+from ..register import CloudFile, Scene, Start
+from ..streams import Cloud, WatchedFolder
+from ..twin import Camera, Home, find_twin
+from .camera import Shot
+from .demo import run_until_interrupted
+from .server import address, open_browser, serving
+from .session import Session
+
+Say = Callable[[str], None]
+
+
+def clouds_of(source: str, scene: Scene, idle: float | None = None) -> Iterable[Cloud]:
+    """Clouds of a source that a person has named, at their own pace: the one place where further kinds join.
+
+    Args:
+        source: a folder that clouds are written into.
+        scene: the twin with the coordinates of the clouds.
+        idle: seconds without anything new after which the source ends; never if not given.
+
+    Raises:
+        ConfigError: no such source.
+    """
+    folder = Path(source)
+    if not folder.is_dir():
+        raise ConfigError(f"SOURCE: expected a folder that clouds are written into, found none at {source}.")
+    try:
+        return WatchedFolder(folder, lambda path: CloudFile(path, scene.outside, scene.normals), idle=idle)
+    except ValueError as error:
+        raise ConfigError(f"--idle: {error}") from None
+
+
+def run_live(
+    place: Path,
+    source: str,
+    options: Mapping[str, Any],
+    *,
+    unit: Unit | None = None,
+    start: Start | None = None,
+    idle: float | None = None,
+    port: int | None = None,
+    browser: bool = True,
+    say: Say = print,
+) -> None:
+    """Show what is registered, until Ctrl-C or the source's end.
+
+    Args:
+        place: the twin; see `find_twin`.
+        source: see `clouds_of`.
+        options: entries of [registration] that replace the twin's.
+        unit: of the clouds; that of the twin's files if not given.
+        start: where the camera stands; in the body's coordinates if not given.
+        idle: see `clouds_of`.
+        port: of the page; the first free one from 8080 on if not given.
+        browser: open the page in a browser where there is a display.
+        say: prints a line.
+
+    Raises:
+        ConfigError, FileError, PoseError, TwinError: what cannot be used, and why.
+    """
+    scene = Scene.of(place, options, unit)
+    clouds = clouds_of(source, scene, idle)
+    with scene.opened(start or Start(), say) as (_, camera):
+        pass
+    _show(scene.home, clouds, options, camera, port, browser, say)
+
+
+def show(
+    twin: Path | str,
+    clouds: Iterable[Cloud],
+    camera: Camera = None,
+    port: int | None = None,
+    browser: bool = True,
+    say: Say = print,
+    **options: Any,
+) -> None:
+    """A page for clouds of your own program, until they end or Ctrl-C.
+
+    Args:
+        twin: its folder.
+        clouds: points (p, 3) in metres, at their own pace; they are asked for in a thread of their own.
+        camera: where the camera stands.
+        port: of the page; the first free one from 8080 on if not given.
+        browser: open the page in a browser where there is a display.
+        say: prints a line.
+        options: entries of [registration] that replace the twin's.
+
+    Raises:
+        ConfigError: the folder is no twin, an option cannot be, or the port is taken.
+    """
+    _show(find_twin(twin), clouds, options, camera, port, browser, say)
+
+
+def _show(
+    home: Home,
+    clouds: Iterable[Cloud],
+    options: Mapping[str, Any],
+    camera: Camera,
+    port: int | None,
+    browser: bool,
+    say: Say,
+) -> None:
+    chosen = {name: value for name, value in options.items() if name != "model"}
+    engine = str(options.get("model") or home.config.registration.model)
+    with serving(port, "softtwin live") as server:
+        session = Session(server, home, options=chosen, camera=camera, engine=engine)
+        say(f"softtwin live: {address(server)}   (Ctrl-C ends it). {NOTICE}")
+        if browser:
+            open_browser(server)
+        run_until_interrupted(lambda: session.run(Shot(cloud) for cloud in clouds), say)

@@ -1,0 +1,127 @@
+"""A page at work without a browser: clouds of folders and iterators, bad ones, another engine, an askew camera."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="viser is absent")
+pytest.importorskip("torch", reason="torch is absent")
+
+from softtwin.app.config import ConfigError
+from softtwin.app.page import server as page_server
+from softtwin.app.page.camera import Shot, TrueStates, View, shot
+from softtwin.app.page.controls import Controls
+from softtwin.app.page.demo import PHANTOM
+from softtwin.app.page.figures import Figures
+from softtwin.app.page.session import Session
+from softtwin.app.page.stream import run_live, show
+from softtwin.app.twin import find_twin
+from softtwin.registration.verdict import Verdict
+
+from .conftest import run
+
+
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch) -> list[Figures]:
+    """All figures that pages have shown."""
+    figures = list[Figures]()
+    plain = Controls.show
+
+    def tell(self: Controls, found: Figures) -> None:
+        figures.append(found)
+        plain(self, found)
+
+    monkeypatch.setattr(Controls, "show", tell)
+    return figures
+
+
+def answered(figures: list[Figures]) -> list[Figures]:
+    return [found for found in figures if found.verdict is not None]
+
+
+def shots(count: int, view: View = View()) -> Iterator[Shot]:  # noqa: B008  (it is frozen)
+    body, states, rng = find_twin(PHANTOM).body, TrueStates.read(PHANTOM), np.random.default_rng(2)
+    for number in range(count):
+        yield shot(body, states, 1.0 + 0.1 * number, view, rng)
+
+
+def slowly(session: Session, source: Any, told: list[Figures]) -> Iterator[Shot]:
+    """The next cloud once the one before was answered."""
+    import time
+
+    for number, found in enumerate(source):
+        yield found
+        deadline = time.monotonic() + 240.0
+        while len(answered(told)) <= number and time.monotonic() < deadline:
+            time.sleep(0.02)
+
+
+def test_a_folder_is_followed_and_a_cloud_that_is_none_is_refused_with_its_reason(
+    tmp_path: Path, told: list[Figures]
+) -> None:
+    np.save(tmp_path / "cloud_1.npy", np.full((5, 3), np.nan))
+    said = list[str]()
+    run_live(PHANTOM, str(tmp_path), {}, idle=1.0, browser=False, say=said.append)
+    assert answered(told)[-1].verdict is Verdict.REFUSED
+    assert answered(told)[-1].reason
+    assert "http://127.0.0.1:" in said[0] and "not a medical device" in said[0]
+
+
+def test_an_iterator_of_clouds_is_shown_without_a_truth(told: list[Figures]) -> None:
+    show(PHANTOM, [next(shots(1)).cloud], browser=False, say=lambda _: None)  # type: ignore[list-item]
+    found = answered(told)[-1]
+    assert found.verdict is Verdict.ACCEPTED
+    assert not found.errors and np.isfinite(found.margins["tumour"])
+    assert found.frame_time > 0 and found.age >= found.frame_time
+
+
+def test_the_organ_that_is_shown_is_the_one_that_was_registered(told: list[Figures]) -> None:
+    home = find_twin(PHANTOM)
+    with page_server.serving() as server:
+        session = Session(server, home, is_simulated=True)
+        session.run(slowly(session, shots(3), told))
+        assert session.picture._cloud is not None and session.picture._cloud.visible
+        assert sum(len(part) for part in session.picture._drawn) == len(session.picture.triangles)
+    found = answered(told)[-1]
+    assert found.errors["tumour"] < 2e-3 < np.linalg.norm(TrueStates.read(PHANTOM).at(1.2)[0], axis=1).max()
+
+
+def test_an_askew_camera_is_found(told: list[Figures]) -> None:
+    view = View(5e-4, turn=np.deg2rad(4.0), shift=5e-3)
+    with page_server.serving() as server:
+        session = Session(server, find_twin(PHANTOM), is_simulated=True)
+        session.controls._sliders[2].value, session.controls._sliders[3].value = 4.0, 5.0
+        assert session.wishes.view.is_askew
+        session.run(slowly(session, shots(2, view), told))
+    found = answered(told)[-1]
+    assert found.verdict is not Verdict.REFUSED
+    assert found.errors["tumour"] < 5e-3  # the camera itself stands 5 mm and 4 degrees off
+
+
+def test_another_engine_goes_on_where_the_first_was(told: list[Figures]) -> None:
+    pytest.importorskip("dolfinx", reason="FEniCSx is absent")
+    with page_server.serving() as server:
+        session = Session(server, find_twin(PHANTOM), is_simulated=True)
+
+        def switched() -> Iterator[Shot]:
+            for number, found in enumerate(shots(2)):
+                session.controls._engine.value = ("surrogate", "hybrid")[number]
+                yield found
+
+        session.run(slowly(session, switched(), told))
+    assert [found.engine for found in answered(told)] == ["surrogate", "hybrid"]
+    assert all(found.verdict is not Verdict.REFUSED for found in answered(told))
+
+
+def test_what_cannot_be_shown_is_said_before_a_page_opens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ConfigError, match="SOURCE: expected a folder"):
+        run_live(PHANTOM, str(tmp_path / "none"), {}, browser=False)
+    assert "expected a twin folder" in run(capsys, "live", tmp_path, tmp_path, "--no-browser", code=2)
+    assert "--idle: " in run(capsys, "live", PHANTOM, tmp_path, "--idle", -1, "--no-browser", code=2)
+    with page_server.serving() as server:
+        taken = server.get_port()
+        for command in (["demo"], ["live", PHANTOM, tmp_path], ["pick", PHANTOM / "organ.toml"]):
+            assert "--port: expected a free port" in run(capsys, *command, "--port", taken, "--no-browser", code=2)
