@@ -654,6 +654,12 @@ def demo(port: int | None, browser: bool, record: Path | None, seconds: float) -
 )
 @click.option("--zone", help="Node set whose nodes may carry force; '' for all loaded nodes.")
 @click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
+@click.option(
+    "--frame",
+    "axes",
+    type=click.Choice(["lps", "ras"], case_sensitive=False),
+    help="Axes of the clouds; the organ's if not given.",
+)
 @click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")
 @click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
 @click.option("--align", type=click.Choice(["auto"]), help="Look for the pose in the first cloud that shows it.")
@@ -664,6 +670,7 @@ def live(
     twin: Path,
     source: str,
     unit: Unit | None,
+    axes: Axes | None,
     matrix: Path | None,
     landmarks: tuple[Path, Path] | None,
     align: str | None,
@@ -672,19 +679,22 @@ def live(
     browser: bool,
     **chosen: Any,
 ) -> None:
-    """Show a live page on this machine: TWIN follows the clouds of SOURCE, a folder that is written to.
+    """Show a live page on this machine: TWIN follows the clouds of SOURCE.
 
-    Nothing is written; `softtwin register --watch` keeps the results.
+    SOURCE is a folder that is written to, or a place of OpenIGTLink (igtl://HOST:PORT, igtl://:PORT to listen; mm and
+    RAS if not given). Nothing is written or sent back; `softtwin register --watch` does that.
     """
     from .page.stream import run_live
     from .register import Start
+    from .sources import parse_source
 
     if sum(given is not None for given in (matrix, landmarks or None, align)) > 1:
         raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
     start = Start(matrix, landmarks or None, align is not None)
     run_live(
-        twin, source, _given(chosen), unit=unit, start=start, idle=idle, port=port, browser=browser, say=click.echo
-    )
+        twin, parse_source(source), _given(chosen), unit=unit, axes=axes, start=start, idle=idle, port=port,
+        browser=browser, say=click.echo,
+    )  # fmt: skip
 
 
 @softtwin.command()

@@ -1,17 +1,18 @@
-"""`softtwin live`: a twin before a real camera; clouds come from a folder, a Python iterator, or what joins here."""
+"""`softtwin live`: a twin before a real camera; clouds come from a folder, a Python iterator, or OpenIGTLink."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from softtwin.meshes.files import Unit
+from softtwin.meshes.files import Axes, Unit
 
 from ..config import ConfigError
 from ..record import NOTICE
 from ..register import CloudFile, Scene, Start
-from ..streams import Cloud, WatchedFolder
+from ..sources import Address, check_idle
+from ..streams import Cloud, Mailbox, WatchedFolder
 from ..twin import Camera, Home, find_twin
 from .camera import Shot
 from .demo import run_until_interrupted
@@ -21,32 +22,45 @@ from .session import Session
 Say = Callable[[str], None]
 
 
-def clouds_of(source: str, scene: Scene, idle: float | None = None) -> Iterable[Cloud]:
-    """Clouds of a source that a person has named, at their own pace: the one place where further kinds join.
+def clouds_of(source: Path | Address, scene: Scene, idle: float | None = None, say: Say = print) -> Iterable[Cloud]:
+    """Clouds of a source that a person has named, at their own pace.
 
     Args:
-        source: a folder that clouds are written into.
+        source: of `parse_source`: a folder that clouds are written into, or a place of OpenIGTLink.
         scene: the twin with the coordinates of the clouds.
         idle: seconds without anything new after which the source ends; never if not given.
+        say: prints a line.
 
     Raises:
-        ConfigError: no such source.
+        ConfigError: no such folder, a time that is none, or normals of a peer that sends none.
     """
-    folder = Path(source)
-    if not folder.is_dir():
-        raise ConfigError(f"SOURCE: expected a folder that clouds are written into, found none at {source}.")
-    try:
-        return WatchedFolder(folder, lambda path: CloudFile(path, scene.outside, scene.normals), idle=idle)
-    except ValueError as error:
-        raise ConfigError(f"--idle: {error}") from None
+    check_idle(idle)
+    if isinstance(source, Address):
+        if scene.normals:
+            raise ConfigError(f"--normals: expected files that hold some, got {source}: its clouds are points alone.")
+        return _heard(source, scene, idle, say)
+    if not source.is_dir():
+        raise ConfigError(f"SOURCE: expected a folder that clouds are written into, or igtl://..., got {source}.")
+    return WatchedFolder(source, lambda path: CloudFile(path, scene.outside, scene.normals), idle=idle)
+
+
+def _heard(address: Address, scene: Scene, idle: float | None, say: Say) -> Iterator[Cloud]:
+    """What a peer sends, the newest alone; nothing is sent back."""
+    from ..openigtlink import Link  # pyigtl is needed here alone
+
+    box = Mailbox()
+    with Link(address, box, scene.outside, idle=idle, say=say):
+        while (arrival := box.take()) is not None:
+            yield arrival.cloud
 
 
 def run_live(
     place: Path,
-    source: str,
+    source: Path | Address,
     options: Mapping[str, Any],
     *,
     unit: Unit | None = None,
+    axes: Axes | None = None,
     start: Start | None = None,
     idle: float | None = None,
     port: int | None = None,
@@ -59,7 +73,8 @@ def run_live(
         place: the twin; see `find_twin`.
         source: see `clouds_of`.
         options: entries of [registration] that replace the twin's.
-        unit: of the clouds; that of the twin's files if not given.
+        unit: of the clouds; if not given that of the twin's files, millimetres for a peer.
+        axes: of the clouds; if not given those of the twin's files, RAS for a peer.
         start: where the camera stands; in the body's coordinates if not given.
         idle: see `clouds_of`.
         port: of the page; the first free one from 8080 on if not given.
@@ -67,10 +82,12 @@ def run_live(
         say: prints a line.
 
     Raises:
-        ConfigError, FileError, PoseError, TwinError: what cannot be used, and why.
+        ConfigError, FileError, PoseError, TwinError, LinkError: what cannot be used, and why.
     """
-    scene = Scene.of(place, options, unit)
-    clouds = clouds_of(source, scene, idle)
+    if isinstance(source, Address):
+        unit, axes = unit or "mm", axes or "ras"
+    scene = Scene.of(place, options, unit, axes)
+    clouds = clouds_of(source, scene, idle, say)
     with scene.opened(start or Start(), say) as (_, camera):
         pass
     _show(scene.home, clouds, options, camera, port, browser, say)

@@ -1,5 +1,6 @@
 """A page at work without a browser: clouds of folders and iterators, bad ones, another engine, an askew camera."""
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ from softtwin.app.page.controls import Controls
 from softtwin.app.page.demo import PHANTOM
 from softtwin.app.page.figures import Figures
 from softtwin.app.page.session import Session
-from softtwin.app.page.stream import run_live, show
+from softtwin.app.page.stream import clouds_of, run_live, show
+from softtwin.app.register import Scene
+from softtwin.app.sources import Address
 from softtwin.app.twin import find_twin
 from softtwin.registration.verdict import Verdict
 
@@ -64,7 +67,7 @@ def test_a_folder_is_followed_and_a_cloud_that_is_none_is_refused_with_its_reaso
 ) -> None:
     np.save(tmp_path / "cloud_1.npy", np.full((5, 3), np.nan))
     said = list[str]()
-    run_live(PHANTOM, str(tmp_path), {}, idle=1.0, browser=False, say=said.append)
+    run_live(PHANTOM, tmp_path, {}, idle=1.0, browser=False, say=said.append)
     assert answered(told)[-1].verdict is Verdict.REFUSED
     assert answered(told)[-1].reason
     assert "http://127.0.0.1:" in said[0] and "not a medical device" in said[0]
@@ -116,9 +119,27 @@ def test_another_engine_goes_on_where_the_first_was(told: list[Figures]) -> None
     assert all(found.verdict is not Verdict.REFUSED for found in answered(told))
 
 
+def test_clouds_of_a_peer_are_heard_in_its_own_unit_and_axes() -> None:
+    """A second process sends them over a socket; the page's source has them in metres and LPS."""
+    pytest.importorskip("pyigtl", reason="pyigtl is absent")
+    from .test_openigtlink import PLACES, process
+
+    scene, heard = Scene.of(PHANTOM, {}, "mm", "ras"), list[Any]()
+    with process() as other:
+        address = Address("127.0.0.1", other.listen(room=0))
+        clouds = iter(clouds_of(address, scene, say=lambda _: None))
+        listening = threading.Thread(target=lambda: heard.append(next(clouds)))
+        listening.start()
+        other.accept()
+        other.send(kind="POINT", device="camera", places=PLACES, polygons=[], version=2, time=1.0)
+        listening.join()
+        clouds.close()  # type: ignore[attr-defined]
+    np.testing.assert_allclose(heard[0], 1e-3 * np.array(PLACES) * [-1, -1, 1], atol=1e-6)
+
+
 def test_what_cannot_be_shown_is_said_before_a_page_opens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ConfigError, match="SOURCE: expected a folder"):
-        run_live(PHANTOM, str(tmp_path / "none"), {}, browser=False)
+        run_live(PHANTOM, tmp_path / "none", {}, browser=False)
     assert "expected a twin folder" in run(capsys, "live", tmp_path, tmp_path, "--no-browser", code=2)
     assert "--idle: " in run(capsys, "live", PHANTOM, tmp_path, "--idle", -1, "--no-browser", code=2)
     with page_server.serving() as server:
