@@ -17,7 +17,7 @@ from softtwin.registration.registrar import Registration
 
 from .export import WRITTEN, Exporter
 from .record import Recorder, describe, describe_estimate
-from .register import Scene, Start, check_any, find_clouds, name_of, registered
+from .register import Scene, Start, check_any, find_clouds, name_of, registered, say_coordinates
 from .twin import Sequence as Frames
 
 Floats = NDArray[np.float64]
@@ -50,6 +50,7 @@ def identify_files(
     scene = Scene.of(place, options, unit)
     clouds, found = find_clouds(names, scene.outside, scene.normals), list[Registration]()
     with scene.opened(start or Start(), say) as (twin, camera):
+        say_coordinates(twin, say)
         frames = Frames(twin, None, camera)
         with Recorder(Exporter(twin, output, WRITTEN)) as recorder:
             for cloud in tqdm(clouds, desc="identifying", unit="cloud", disable=None):

@@ -16,7 +16,7 @@ from .config import ConfigError
 from .export import WRITTEN, Exporter
 from .landmarks import MarkFiles
 from .record import Recorder, counts, describe
-from .register import Scene, Start, check_any, check_budget, name_of, registered
+from .register import Scene, Start, check_any, check_budget, name_of, registered, say_coordinates
 from .sources import Address, check_idle, opened
 from .streams import Clock, Mailbox
 from .twin import Camera, Frame, Sequence, Twin
@@ -177,6 +177,7 @@ def watch_source(
     if marks is not None and isinstance(source, Address):
         raise ConfigError(f"--marks: expected clouds in files, which marks go with by their names, got {source}.")
     with scene.opened(start, say) as (twin, camera):
+        say_coordinates(twin, say)
         twin.registrar()  # prepared before the first cloud is waited for
         with opened(source, scene, twin, idle, say) as feed:
             rows = register_live(

@@ -213,6 +213,7 @@ def register_files(
     start = start or Start()
     marks = scene.marks(start, [cloud.path for cloud in clouds])
     with scene.opened(start, say) as (twin, camera):
+        say_coordinates(twin, say)
         chosen = formats or WRITTEN
         rows = register_clouds(
             twin, clouds, output, camera=camera, truth=positions, formats=chosen, budget=budget, marks=marks, say=say
@@ -298,10 +299,14 @@ class Scene:
             say(describe_landmarks(fit))
             pose = fit.pose
         with self.home.twin(**self.options) as twin:
-            say(f"results in {twin.written_in.unit}, {twin.written_in.axes.upper()}")
-            for note in notes_on(twin):
-                say(note)
             yield twin, "align" if start.align else camera_of(twin, pose)
+
+
+def say_coordinates(twin: Twin, say: Callable[[str], None]) -> None:
+    """Say in which unit and on which axes results are written."""
+    say(f"results in {twin.written_in.unit}, {twin.written_in.axes.upper()}")
+    for note in notes_on(twin):
+        say(note)
 
 
 def camera_of(twin: Twin, pose: Pose | None) -> Pose | PosePrior | None:
