@@ -16,6 +16,8 @@ import pytest
 pytest.importorskip("markdown_it", reason="markdown-it-py is absent")
 pytest.importorskip("mkdocs", reason="the extra docs is absent")
 
+from softtwin.app.twin import Twin
+
 from .conftest import PAGES, ROOT, Block, CommandLines, blocks_of, commands_of, parse_toml
 
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
@@ -24,8 +26,9 @@ BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 ALONE = ["docs/materials.md", "docs/networks.md"]
 WITH_A_TWIN = ["README.md", "docs/registration.md", "docs/doubt.md"]
 WHOLE = ["docs/tutorial.md"]  # commands and Python, one after the other, as a reader goes through them
+A_PAGE = ["docs/live.md"]  # Python that shows a page in a browser
 ELSEWHERE = {"docs/reference.md": "tests/reference/test_docs.py", "docs/surrogates.md": "tests/surrogate/test_docs.py"}
-RUN = {*ALONE, *WITH_A_TWIN, *WHOLE, *ELSEWHERE}
+RUN = {*ALONE, *WITH_A_TWIN, *WHOLE, *A_PAGE, *ELSEWHERE}
 
 
 def of_kind(*kinds: str) -> list[Any]:
@@ -122,6 +125,22 @@ def test_a_page_runs_on_a_twin(page: str, here: Path, small_quickstart: Path, ca
     cloud = np.load(here / "liver" / "demo" / "cloud.npy")
     run_python(page, {"cloud": cloud, "clouds": [cloud, cloud], "camera": [cloud, cloud], "np": np})
     assert re.search("accepted|doubtful", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("page", A_PAGE)
+def test_a_page_shows_a_page(page: str, here: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """The package's phantom is the twin; one cloud comes, and no browser is opened."""
+    pytest.importorskip("viser", reason="viser is absent")
+    pytest.importorskip("torch", reason="torch is absent")
+    from softtwin.app.page.demo import PHANTOM
+
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    shutil.copytree(PHANTOM, here / "liver" / "twin")
+    with Twin.open(PHANTOM) as twin:
+        cloud = twin.body.points[np.unique(twin.body.boundary)] + np.array([0.0, 0.0, 1e-3])
+    run_python(page, {"camera_frames": lambda: [cloud]})
+    assert "http://127.0.0.1:" in capsys.readouterr().out
 
 
 @pytest.mark.fenicsx
