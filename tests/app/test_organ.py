@@ -178,8 +178,8 @@ def test_a_unit_that_a_file_states_is_taken_and_none_against_it(
 ) -> None:
     path, place = tmp_path / f"organ.{kind}", Coordinates("mm", "ras")
     write_surface(path, Surface(place.lengths(phantom.points), phantom.boundary), place=place)
-    assert _stated_unit(path) == _stated_unit(Path(f"{path}:ras")) == "mm"  # what `softtwin build` takes
-    assert _stated_unit(tmp_path / "yet to be written.stl") is None and _stated_unit(files / "organ.stl") is None
+    assert _stated_unit(str(path)) == _stated_unit(f"{path}:ras") == "mm"  # what `softtwin build` takes
+    assert _stated_unit(str(tmp_path / "not yet written.stl")) is None is _stated_unit(str(files / "organ.stl"))
     with pytest.raises(ConfigError, match=r'body\.unit: .* states that it is in mm, got \'m\'; write unit = "mm"'):
         make(files, source=f"{path}:ras", unit="m")
     inner = tmp_path / f"tumour.{kind}"
