@@ -389,7 +389,7 @@ def test_a_twin_on_a_regular_grid_registers_clouds_of_the_surface(capsys, tmp_pa
     cloud = partial_view(body, truth, (0.0, -1.0, 0.5), 400, 0.0, np.random.default_rng(0))
     np.save(tmp_path / "cloud.npy", cloud)
     run(capsys, "register", out, tmp_path / "cloud.npy", "--output", tmp_path / "found", "--format", "vtp")
-    moved = pyvista.read(tmp_path / "found" / "organ_0000.vtp").points
+    moved = 1e-3 * pyvista.read(tmp_path / "found" / "organ_0000.vtp").points  # millimetres
     apart = np.linalg.norm(moved - outer(body).moved(truth).points, axis=1)
     assert apart.mean() < 0.2 * np.linalg.norm(outer(body).carried(truth), axis=1).mean()
     edit(out, 'architecture = "reduced"', 'architecture = "umesh"')
