@@ -343,6 +343,7 @@ _CORE: Mapping[str, tuple[Callable[[], Check], str]] = {
 _LOADED = ("scipy", "zarr", "meshio", "gmsh", "pytetwild", "small_gicp")
 _NOT_FOR_USE = (
     "fenicsx",
+    "register",  # the core and torch, as small as may be: each of its packages has a line already
     "benchmark",
     "test",
     "docs",
