@@ -52,6 +52,7 @@ Floats = NDArray[np.float64]
 SHAPES: dict[str, Callable[..., Body]] = {"liver-phantom": liver_phantom, "propeller": propeller, "beam": beam}
 _COARSEST = 0.2  # of the body's size: the edge of a grid's cells
 _MOSTLY = 0.5  # of an inner surface's vertices: more outside the body, and it belongs to another one
+_LONG = 2.0  # edges of a mesh of n nodes in a volume V are shorter than this times (V / n)^(1/3)
 _TOUCHING = 1e-3  # of the body's size: nearer to it a point outside is round-off of the mesh
 
 
@@ -237,6 +238,8 @@ def _solid(section: BodySection, reader: _Reader, source: File) -> tuple[Floats,
     _check_size(reader.root / source.path, float(np.ptp(points, axis=0).max()), source.unit or section.unit)
     if not isinstance(found, Surface):
         return *found, []
+    if reader.scan is not None:
+        reader.scan.check_touching(found, section.cell_size or _LONG * float(np.cbrt(found.volume / section.nodes)))
     if section.cell_size > 0.0:
         solid = solidify(found, cell_size=section.cell_size)
     else:

@@ -36,11 +36,13 @@ class Scan:
         segmentation: the labels.
         organ: the label of the body.
         labels: label of each inner structure that is no file, by the structure's name.
+        touching: what has to touch the organ.
     """
 
     segmentation: Segmentation
     organ: str
     labels: Mapping[str, str]
+    touching: tuple[Touching, ...] = ()
 
     def surface(self) -> tuple[Surface, list[str]]:
         """The organ's surface, and what to say of it.
@@ -77,12 +79,32 @@ class Scan:
         if region.distance is None and (away <= reach).sum() < _FEW:
             reach = max(edge, reach)
         if not (away <= reach).any():
-            raise RegionError(
-                f"touching {region.label}: expected it within {1e3 * reach:.3g} mm of {self.organ}, it is "
-                f"{1e3 * away.min():.3g} mm away; touching:{region.label}:{np.ceil(1e3 * away.min()) + 1:g}mm reaches "
-                "it, if it holds the organ at all."
-            )
+            raise self._out_of_reach(region, reach, float(away.min()))
         return away <= reach
+
+    def check_touching(self, surface: Surface, edge: float) -> None:
+        """Refuse before a mesh is made what no mesh of this surface comes near.
+
+        Args:
+            surface: the organ's.
+            edge: that no cell exceeds, metres.
+
+        Raises:
+            RegionError: with how far away it is.
+        """
+        for region in self.touching:
+            away = float(distances_to(self.segmentation, region.label, surface.points).min())
+            voxel = voxel_diagonal(self.segmentation, region.label)  # a mesh's boundary is as near to the surface
+            reach = region.distance or max(edge, voxel)
+            if away > reach + voxel:
+                raise self._out_of_reach(region, reach, away)
+
+    def _out_of_reach(self, region: Touching, reach: float, away: float) -> RegionError:
+        return RegionError(
+            f"touching {region.label}: expected it within {1e3 * reach:.3g} mm of {self.organ}, it is "
+            f"{1e3 * away:.3g} mm away; touching:{region.label}:{np.ceil(1e3 * away) + 1:g}mm reaches it, if it holds "
+            "the organ at all."
+        )
 
 
 def open_scan(section: BodySection, root: Path, regions: Iterable[Region]) -> Scan:
@@ -101,9 +123,9 @@ def open_scan(section: BodySection, root: Path, regions: Iterable[Region]) -> Sc
     _check_frame(section, path)
     segmentation = read_segmentation(path, files_axes(section))
     inner = {name: text for name, text in section.inner.items() if not (root / parse_file(text).path).is_file()}
-    scan = Scan(segmentation, section.organ or the_organ(segmentation), inner)
-    touched = [region.label for region in regions if isinstance(region, Touching)]
-    for label in (scan.organ, *inner.values(), *touched):
+    touching = tuple(region for region in regions if isinstance(region, Touching))
+    scan = Scan(segmentation, section.organ or the_organ(segmentation), inner, touching)
+    for label in (scan.organ, *inner.values(), *(region.label for region in touching)):
         find(segmentation, label)
     return scan
 

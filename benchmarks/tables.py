@@ -543,6 +543,59 @@ def misspecified(name: str) -> None:
             )
 
 
+def segmentations() -> None:
+    """Surfaces made of voxels: volume, and distances to the true surface."""
+    found = recorded("segmentations")
+    if not found:
+        return
+    head("voxels, mm", "volume", "mean mm", "95 %", "largest", "s")
+    for label, f in found["surfaces"].items():
+        row(
+            label,
+            f"{100 * f['volume_off']:+.2f} %",
+            *(f"{f[name]:.2f}" for name in ("mean_mm", "p95_mm", "largest_mm")),
+            f"{f['seconds']:.1f}",
+        )
+
+
+def live_page() -> None:
+    """The page in a browser: updates, pulls, five of them, memory."""
+    f = recorded("live_page")
+    if not f:
+        return
+    head("live page", "reached", "asked")
+    row("page served; first vertices there, s", f"{f['seconds_to_page']:.1f}; {f['seconds_to_first_update']:.1f}", 15)
+    row("vertex updates a second that the browser receives", f"{f['updates_a_second']:.1f}", 30)
+    pull = f["pull_to_answer_ms"]
+    row(f"pull to answer, {f['pulls']} pulls, ms", f"{pull['median']:.0f} (95 %: {pull['p95']:.0f})", "95 %: 100")
+    five = f["five_browsers_updates_a_second"]
+    row("five browsers, updates a second each", f"{min(five):.1f} to {max(five):.1f}", "at once")
+    memory = f["memory_mib"]
+    row(
+        f"resident memory over {memory['seconds']:.0f} s: first, middle, last, MiB",
+        "; ".join(f"{memory[name]:.0f}" for name in ("first", "middle", "last")),
+        "flat",
+    )
+    row("cores used with no browser", f"{f['cores_used_with_no_browser']:.2f}", "-")
+
+
+def openigtlink() -> None:
+    """Round trips over a socket with a second process."""
+    found = recorded("openigtlink")
+    if not found:
+        return
+    head("OpenIGTLink", "points in", "vertices out", "kB in; out", "Hz", "round ms (95 %)")
+    for label, f in found.items():
+        row(
+            label,
+            f["points_in"],
+            f["surface_vertices"] + f["inner_vertices"],
+            f"{f['bytes_in'] / 1e3:.0f}; {f['bytes_out'] / 1e3:.0f}",
+            f"{f['rate_hz']:.1f}",
+            f"{f['round_ms']['p50']:.1f} ({f['round_ms']['p95']:.1f})",
+        )
+
+
 def print_all() -> None:
     """All tables, with a line on what stands in none."""
     for model in ("surrogate", "reference"):
@@ -568,6 +621,9 @@ def print_all() -> None:
     inverse()
     misspecified("misspecified")
     misspecified("misspecified_doubt")
+    segmentations()
+    live_page()
+    openigtlink()
 
 
 def tables_of(text: str) -> dict[str, list[str]]:

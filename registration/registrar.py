@@ -468,7 +468,7 @@ class Registrar:
             if not way.trace or time.monotonic() >= solver.until:
                 break
             try:
-                near = problem.trial(way.trial.coefficients, way.trial)
+                near = problem.trial(way.trial.coefficients, replace(way.trial, state=near.state))
             except NotConverged:
                 break
             spent.append(replace(way, evaluations=1))  # states of the exact model alone are counted

@@ -7,11 +7,12 @@ design is hIPPYlib's GaussianLRPosterior: Villa, Petra and Ghattas, ACM Trans. M
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
 from softtwin.meshes.embedding import Embedding
@@ -56,9 +57,13 @@ class Uncertainty:
         return every
 
     @cached_property
+    def _of_nodes(self) -> Floats:
+        return self.covariances()
+
+    @cached_property
     def deviation(self) -> Floats:
         """Root mean square length of each node's error, (n,), metres."""
-        return np.sqrt(np.trace(self.covariances(), axis1=1, axis2=2))
+        return np.sqrt(np.trace(self._of_nodes, axis1=1, axis2=2))
 
     def margin(self, points: Embedding | None = None, confidence: float = 0.95) -> Floats:
         """Distance within which each point is of where it was found, with so much confidence, (p,), metres.
@@ -75,7 +80,7 @@ class Uncertainty:
         """
         if not 0.0 < confidence < 1.0:
             raise ValueError(f"Uncertainty.margin.confidence: expected a number in (0, 1), got {confidence}.")
-        every = self.covariances(points)
+        every = self._of_nodes if points is None else self.covariances(points)
         mean = np.trace(every, axis1=1, axis2=2)
         if not np.isfinite(mean).all():
             return np.full(len(mean), np.inf)
@@ -83,7 +88,14 @@ class Uncertainty:
         known = squares > 0.0
         freedom = np.divide(mean**2, squares, out=np.ones_like(mean), where=known)
         factor = np.divide(squares, mean, out=np.zeros_like(mean), where=known)
-        return np.sqrt(factor * chi2.ppf(confidence, freedom))
+        return np.sqrt(factor * np.exp(_log_quantile(confidence)(freedom)))
+
+
+@lru_cache
+def _log_quantile(confidence: float) -> CubicSpline:
+    """Logarithm of chi-square's quantile by its degrees of freedom, 1 to 3 as a law of three components has."""
+    freedom = np.linspace(0.99, 3.01, 203)
+    return CubicSpline(freedom, np.log(chi2.ppf(confidence, freedom)))
 
 
 def unseen_response(model: ReducedModel, forces: Forces) -> Floats:

@@ -77,9 +77,8 @@ class SurrogateState:
         Raises:
             ValueError: another shape, numbers that are not finite, or changes at nodes that never carry load.
         """
-        maps = self._surrogate.maps
-        columns = self._surrogate.at_loaded("changes", changes)
-        return maps.linear(columns) + maps.decoded(tangent(self._inner, maps.encoded(columns)))
+        linear, encoded = self._surrogate.linear_push(changes)
+        return linear + self._surrogate.maps.decoded(tangent(self._inner, encoded))
 
     def pull(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3): J^T g, zero at nodes that never carry load.
@@ -120,6 +119,7 @@ class Surrogate:
         self.card: Mapping[str, Any] = MappingProxyType(dict(card))
         self.rows = (3 * maps.loaded[:, None] + np.arange(3)).ravel()
         self._wanted: tuple[Ints, Floats] = np.zeros(0, dtype=np.int64), maps.left[:0]  # rows, left's rows
+        self._pushed: tuple[Floats, Floats, Floats] | None = None  # changes, linear parts, coordinates
         self._idle = np.setdiff1d(np.arange(len(body.points)), np.union1d(maps.loaded, body.fixed))
 
     @cached_property
@@ -217,6 +217,17 @@ class Surrogate:
         if not np.array_equal(self._wanted[0], rows):  # each cold frame asks for the same again
             self._wanted = rows, np.ascontiguousarray(self.maps.left[rows])
         return self._wanted[1] @ (columns if self.maps.right is None else self.maps.right @ columns)
+
+    def linear_push(self, changes: ArrayLike) -> tuple[Floats, Floats]:
+        """What changes of the forces B, (3n, k), do in any state: J B's linear part, (3n, k), and coordinates, (d, k).
+
+        Raises:
+            ValueError: see `SurrogateState.push`.
+        """
+        if self._pushed is None or not np.array_equal(self._pushed[0], changes):  # each frame asks for the same again
+            columns = self.at_loaded("changes", changes)
+            self._pushed = np.array(changes, dtype=np.float64), self.maps.linear(columns), self.maps.encoded(columns)
+        return self._pushed[1], self._pushed[2]
 
     def with_card(self, **entries: Any) -> Surrogate:
         """The same surrogate with more entries in its card, for instance held-out errors."""

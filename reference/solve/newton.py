@@ -151,7 +151,9 @@ class Newton:
         self.tangent.factorisations = self.local_iterations = 0
         self.trace: list[Iteration] = []
 
-    def run(self, load: DiscreteLoad, start: Floats, factor: float = 1.0, eliminate: bool = False) -> Attempt:
+    def run(
+        self, load: DiscreteLoad, start: Floats, factor: float = 1.0, eliminate: bool = False, near: bool = False
+    ) -> Attempt:
         """Iterate from a start whose held unknowns are where they should be.
 
         Args:
@@ -159,6 +161,7 @@ class Newton:
             start: unknowns to start from.
             factor: part of the full load that this is, for the trace.
             eliminate: balance few cells alone where a step is cut, a few times; then give up.
+            near: the tangent that is known is that of a state nearby: it is kept from the first iteration on.
         """
         self.tangent.suit(load)
         self._snes.setKSP(self.tangent.linear.ksp)
@@ -168,6 +171,7 @@ class Newton:
         self._eliminations = 0 if eliminate and self._can_eliminate else None
         self._length = 1.0
         self._reached: float | None = None  # potential where the last step led
+        self._is_near = near
         self._secants.clear()
         self._start_tolerance(load)
         self._x.array[:] = start
@@ -210,8 +214,10 @@ class Newton:
 
     def _keeps_factorisation(self) -> bool:
         """Whether the last factorisation, at the rate of the last iteration, is soon enough at the tolerance."""
-        if not self.options.chord or not self.tangent.is_known or len(self._norms) < 2:
+        if not self.options.chord or not self.tangent.is_known:
             return False
+        if len(self._norms) < 2:
+            return self._is_near
         rate = self._norms[-1] / self._norms[-2]
         return rate < 1.0 and self._absolute_tolerance >= rate**_CHORD_STEPS * self._norms[-1]
 

@@ -166,7 +166,7 @@ class Problem:
         spent = 0
         if self.options.first_step == 1.0 or guess is not None or proposal is not None:
             for start in self._starts.candidates(wanted, guess, proposal, fallback):
-                attempt = self._newton.run(wanted, start.unknowns, eliminate=start.may_leave)
+                attempt = self._newton.run(wanted, start.unknowns, eliminate=start.may_leave, near=start.has_tangent)
                 spent += attempt.iterations
                 if attempt.converged and (start.name != "proposal" or self._is_lowest(attempt, wanted, stability)):
                     found = replace(attempt, iterations=spent)

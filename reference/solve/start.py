@@ -32,11 +32,13 @@ class Start:
         name: where it comes from: `guess`, `proposal`, `linear response` (warped) or `rest`.
         may_leave: whether another equilibrium than the nearest may be found from here: then a few cells may be balanced
             alone on the way.
+        has_tangent: whether the tangent that is factored is that of a state nearby.
     """
 
     unknowns: Floats
     name: str
     may_leave: bool = True
+    has_tangent: bool = False
 
 
 class Starts:
@@ -76,7 +78,7 @@ class Starts:
         """
         near, is_trusted = (None, False) if guess is None else self._near(guess, load)
         if near is not None and is_trusted:
-            yield Start(near, "guess", may_leave=False)
+            yield Start(near, "guess", may_leave=False, has_tangent=isinstance(guess, Equilibrium))
             if not fallback:
                 return
         linear = self._linear_response(load)

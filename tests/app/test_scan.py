@@ -19,7 +19,8 @@ from softtwin.app.config import Config, ConfigError, parse_config
 from softtwin.app.organ import Organ, make_organ
 from softtwin.app.twin import coordinates_of
 from softtwin.meshes.attachment import RegionError
-from softtwin.meshes.files import FileError
+from softtwin.meshes.body import Body
+from softtwin.meshes.files import FileError, read_volume
 
 ORGAN = ellipsoid((14.0, -28.0, 218.0), (34.0, 22.0, 27.0))
 TUMOUR = ellipsoid((24.0, -30.0, 222.0), (9.0, 8.0, 8.0))
@@ -77,9 +78,13 @@ def test_a_picked_point_and_a_box_are_in_the_units_and_axes_of_the_file(files: P
     assert all(len(nodes) >= 3 and nodes[:, 1].max() < -38.0 for nodes in held)
 
 
-def test_what_does_not_touch_is_refused_with_its_distance(files: Path) -> None:
+@pytest.mark.parametrize("words", ["touching:gallbladder", "touching:gallbladder:2mm"])
+def test_what_does_not_touch_is_refused_with_its_distance_before_a_mesh_is_made(
+    files: Path, monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    monkeypatch.setattr("softtwin.app.organ.solidify", lambda *_, **__: pytest.fail("a mesh was made"))
     with pytest.raises(RegionError, match=r"touching gallbladder: expected it within .* of liver, it is .* mm away"):
-        made(files, fixed="touching:gallbladder")
+        made(files, fixed=words)
 
 
 def test_words_that_cannot_be_are_refused_before_a_mesh_is_made(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,3 +122,26 @@ def test_a_unit_or_frame_that_contradicts_the_file_is_refused(
 def test_a_file_that_says_no_frame_takes_the_users(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = built(monkeypatch, files / "placeless.nrrd", "--frame", "ras", "--organ", "1", "--fixed", "touching:3")
     assert coordinates_of(config).axes == "ras" and config.body.organ == "1"
+
+
+@pytest.mark.liver
+def test_the_real_liver_comes_back_from_flat_voxels(liver_folder: Path, tmp_path: Path) -> None:
+    pyvista = pytest.importorskip("pyvista")
+    points, cells = read_volume(liver_folder / "mesh-default" / "liver.msh")
+    fixed = np.load(liver_folder / "mesh-default" / "dirichlet-vertices.npy")
+    truth = Body(points, cells, {"fixed": fixed})
+    surface = pyvista.PolyData.from_regular_faces(1e3 * points, truth.boundary_surface.triangles).clean()
+    low, high = np.reshape(surface.bounds, (3, 2)).T
+    grid = Grid((0.9, 0.9, 2.5), half=tuple((high - low) / 2 + 8), middle=tuple((low + high) / 2))
+    image = pyvista.ImageData(dimensions=grid.shape, spacing=grid.spacing, origin=grid.origin)
+    mask = surface.voxelize_binary_mask(reference_volume=image)["mask"].reshape(grid.shape, order="F")
+    write_nifti(tmp_path / "liver.nii.gz", grid, mask.astype(np.uint8), {1: "liver"})
+    picked = points[fixed[0]]
+    held = f"ball:{','.join(f'{1e3 * x:.2f}' for x in picked * (-1, -1, 1))}:20mm"
+    section = {"source": "liver.nii.gz:ras", "unit": "mm", "nodes": 1200, "fixed": held}
+    body = make_organ(parse_config({"body": section}).body, tmp_path).body
+    assert body.volume == pytest.approx(truth.volume, rel=0.02)  # flat faces between nodes cost a little
+    made = pyvista.PolyData(1e3 * body.points[body.boundary_nodes])
+    away = np.abs(made.compute_implicit_distance(surface)["implicit_distance"])
+    assert away.mean() < 0.5 and away.max() < 2.5
+    assert len(body.fixed) > 5 and np.linalg.norm(body.points[body.fixed] - picked, axis=1).max() < 0.02

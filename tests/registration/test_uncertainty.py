@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import embed
@@ -54,6 +55,13 @@ def test_the_margin_of_a_normal_law_is_its_quantile(rng: np.random.Generator) ->
     assert law.deviation[0] == pytest.approx(np.sqrt((lengths**2).mean()), rel=0.01)
     with pytest.raises(ValueError, match=r"confidence: expected a number in \(0, 1\), got 1\.0"):
         law.margin(confidence=1.0)
+
+
+@pytest.mark.parametrize("free", [1, 2, 3])
+def test_the_margin_of_an_even_law_is_that_of_chi_square(free: int) -> None:
+    law = Uncertainty(2e-3 * np.eye(3)[:, :free], np.zeros(1))
+    for confidence in (0.05, 0.5, 0.95, 0.999):
+        assert law.margin(confidence=confidence)[0] == pytest.approx(2e-3 * chi.ppf(confidence, free), rel=1e-7)
 
 
 def test_what_is_not_known_has_no_margin(body: Body, rng: np.random.Generator) -> None:

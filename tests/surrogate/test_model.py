@@ -63,6 +63,16 @@ def test_perceptron_is_linear_between_its_kinks(perceptron: Surrogate, forces: n
     assert np.linalg.norm(change - slope) < 1e-6 * np.linalg.norm(change)
 
 
+def test_a_push_of_changes_that_were_written_over_is_a_new_one(surrogate: Surrogate, forces: np.ndarray) -> None:
+    """What does not depend on the state is remembered between pushes."""
+    columns = np.stack([_direction(surrogate, seed, 1.0).ravel() for seed in range(3)], axis=1)
+    states = surrogate.solve(forces), surrogate.solve(0.5 * forces)
+    before = [state.push(columns) for state in states]
+    columns *= 2.0
+    for state, once in zip(states, before, strict=True):
+        assert np.abs(state.push(columns) - 2.0 * once).max() < 1e-12 * np.abs(once).max()
+
+
 def test_push_and_pull_are_adjoint(surrogate: Surrogate, forces: np.ndarray) -> None:
     state = surrogate.solve(forces)
     columns = np.stack([_direction(surrogate, seed, 1.0).ravel() for seed in range(3)], axis=1)
