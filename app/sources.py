@@ -145,7 +145,11 @@ def opened(
     """
     check_idle(idle)
     if isinstance(source, Path):
-        yield Feed(fed(WatchedFolder(source, lambda path: CloudFile(path, scene.outside, scene.normals), idle=idle)))
+
+        def read(path: Path) -> CloudFile:
+            return CloudFile(path, scene.outside, scene.normals)
+
+        yield Feed(fed(WatchedFolder(source, read, idle=idle, say=say)))
         return
     if scene.normals:
         raise ConfigError(

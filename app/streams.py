@@ -122,15 +122,16 @@ class WatchedFolder:
     """Clouds that are written into a folder, each once and only when it is whole, in the order of their numbers.
 
     A file is whole when its size and time have not changed from one look to the next and it is not empty. What is there
-    when the watch begins counts, too.
+    when the watch begins counts, too; so does all that is in a folder that was taken away and comes back.
 
     Args:
-        folder: to look into; it may come later.
+        folder: to look into; it may come later, go and come back.
         read: makes a cloud of a file.
         every: seconds between two looks.
         idle: seconds without anything new after which the watch ends; never if not given.
         clock: seconds of a monotonic clock.
         sleep: waits so many seconds.
+        say: prints a line where the folder is not there, and when it is again.
     """
 
     def __init__(
@@ -141,20 +142,25 @@ class WatchedFolder:
         idle: float | None = None,
         clock: Clock = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
+        say: Callable[[str], None] = print,
     ) -> None:
         if not 0.0 < every < np.inf:
             raise ValueError(f"WatchedFolder.every: expected a positive time in seconds, got {every}.")
         if idle is not None and not 0.0 < idle < np.inf:
             raise ValueError(f"WatchedFolder.idle: expected a positive time in seconds, got {idle}.")
         self._folder, self._read, self._every, self._idle = folder, read, every, idle
-        self._clock, self._sleep = clock, sleep
+        self._clock, self._sleep, self._say = clock, sleep, say
 
     def __iter__(self) -> Iterator[CloudFile]:
         given: set[Path] = set()
         seen: dict[Path, tuple[int, int]] = {}
-        last = self._clock()
+        last, is_there = self._clock(), True
         while True:
             now = self._look(given)
+            if is_there != self._folder.is_dir():
+                is_there = not is_there
+                self._say(f"{self._folder}: there again" if is_there else f"{self._folder}: no such folder, waiting")
+                given.clear()
             whole = [path for path, state in now.items() if seen.get(path) == state]
             for path in sorted(whole, key=lambda path: by_numbers(str(path))):
                 given.add(path)
@@ -168,8 +174,12 @@ class WatchedFolder:
 
     def _look(self, given: set[Path]) -> dict[Path, tuple[int, int]]:
         """Size and time of the files that were not given yet."""
-        found = {}
-        for path in self._folder.glob("*"):
+        found: dict[Path, tuple[int, int]] = {}
+        try:
+            paths = list(self._folder.iterdir())
+        except OSError:  # the folder is not there, or not now
+            return found
+        for path in paths:
             if path.suffix.lower() not in CLOUDS or path in given or path.name.startswith("."):
                 continue
             try:

@@ -41,7 +41,7 @@ def clouds_of(source: Path | Address, scene: Scene, idle: float | None = None, s
         return _heard(source, scene, idle, say)
     if not source.is_dir():
         raise ConfigError(f"SOURCE: expected a folder that clouds are written into, or igtl://..., got {source}.")
-    return WatchedFolder(source, lambda path: CloudFile(path, scene.outside, scene.normals), idle=idle)
+    return WatchedFolder(source, lambda path: CloudFile(path, scene.outside, scene.normals), idle=idle, say=say)
 
 
 def _heard(address: Address, scene: Scene, idle: float | None, say: Say) -> Iterator[Cloud]:

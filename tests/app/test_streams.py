@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -135,6 +136,27 @@ def test_a_file_that_grows_is_waited_for(tmp_path: Path) -> None:
 def test_an_empty_file_and_an_empty_folder_are_nothing(tmp_path: Path) -> None:
     assert watched(tmp_path / "later", {}) == []
     assert watched(tmp_path, {1: [("cloud_1.xyz", "")]}) == []
+
+
+def test_a_folder_that_disappears_is_said_and_waited_for(tmp_path: Path) -> None:
+    folder, clock, said, looks = tmp_path / "Kamera ä", Clock(), list[str](), [0]
+
+    def write() -> None:
+        folder.mkdir()
+        (folder / "Wolke 1.xyz").write_text("0 0 0\n")
+
+    def sleep(seconds: float) -> None:
+        looks[0] += 1
+        clock.wait(seconds)
+        if looks[0] == 4:
+            shutil.rmtree(folder)
+        elif looks[0] == 8:
+            write()
+
+    write()
+    source = WatchedFolder(folder, lambda path: CloudFile(path, Coordinates()), 0.1, 1.0, clock, sleep, said.append)
+    assert [file.path.name for file in source] == ["Wolke 1.xyz", "Wolke 1.xyz"]
+    assert said == [f"{folder}: no such folder, waiting", f"{folder}: there again"]
 
 
 @pytest.mark.parametrize("option", ["every", "idle"])
