@@ -1,6 +1,7 @@
 """Noise of the pose and of the cloud (figure 6.16 of the thesis): how far organ and net force are off, level by level.
 
     python benchmarks/pose_noise.py [--twin TWIN] [--engines surrogate reference] [--draws 1000] [--reference-draws 100]
+                                    [--levels 1e-4 1e-3]
 
 One frame of the real liver. As in the thesis the body at rest is turned about the origin of its coordinates by a
 rotation vector and shifted, each component normal with deviation s (rad, metres), every point of the cloud is moved by
@@ -84,6 +85,7 @@ def main() -> None:
     parser.add_argument("--engines", nargs="+", default=["surrogate", "reference"], choices=["surrogate", "reference"])
     parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--reference-draws", type=int, default=100)
+    parser.add_argument("--levels", nargs="+", type=float, default=LEVELS, help="s, of them the ones to run")
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
     found, data = recorded(arguments.name), sequence(SEQUENCE)
@@ -95,7 +97,7 @@ def main() -> None:
                 prior = PosePrior(Pose.identity(), model.body.points.mean(axis=0), _TURN, _SHIFT) if has_pose else None
                 registrar = registrar_for(model, data.zone, True, prior)
                 clean = registrar.register(data.clouds[FRAME])
-                for s in LEVELS:
+                for s in arguments.levels:
                     key = f"{engine}, {kind}, s {s:g}"
                     if key not in found:
                         found[key] = {**level(registrar, clean, model.body, s, draws, has_pose), "made": stamp()}
