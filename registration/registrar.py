@@ -43,6 +43,7 @@ _SPREAD_ANYWHERE = 0.7  # where a cloud tells the size of forces of which most a
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
+_SEARCHING = 0.7  # of the time that is left for a frame: the search from rest, whose end takes the others
 _DOUBTS, _SURE = 3, 0.1  # times that the model's error is scaled anew; not where that changes it by less
 _MISSED, _EXPLAINED = 1.0, 0.5  # times the least noise, shared by neighbours; part of it that forces anywhere leave
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
@@ -379,7 +380,7 @@ class Registrar:
         match = found.trial.match  # with those points that were taken for outliers: patches of them are none
         alike = shared(self.observed.feet(match), match.distances, np.ones(len(match.distances)))
         is_missed = found.rms_distance * np.sqrt(alike) > _MISSED * self.noise.least
-        if not is_missed or time.monotonic() >= self.options.solver.until:
+        if not is_missed or self._is_late:
             return found
         with suppress(NotConverged):
             other = self.anywhere().limited(self.options.solver.until).marked(self.marks).register(cloud)
@@ -407,9 +408,16 @@ class Registrar:
             found = solver.solve(problem, near.coefficients, near)
             problem, found, doubt = self._doubted(problem, found, start.doubt, solver)
             result = self._result(problem, found, start.prepared, begin, doubt)
-        if start.prepared is not self._everywhere and self._has_left(result, start):
-            return self._cold(points, begin)
-        return result
+        if start.prepared is self._everywhere or not self._has_left(result, start) or self._is_late:
+            return result
+        now = time.monotonic()
+        hurried = self.limited(now + _SEARCHING * (self.options.solver.until - now))
+        cold = hurried._cold(points, begin)
+        return min(result, cold, key=badness) if cold.outcome is Outcome.OUT_OF_TIME else cold
+
+    @property
+    def _is_late(self) -> bool:
+        return time.monotonic() >= self.options.solver.until
 
     def refine(
         self, cloud: ArrayLike, draft: Registration, fast: ForwardModel, last: Registration | None = None
@@ -502,7 +510,7 @@ class Registrar:
         except NotConverged:
             return self.register(cloud)
         began_anew = warm.prepared is not last.prepared
-        if warm.judgement.verdict is Verdict.ACCEPTED or began_anew or time.monotonic() >= self.options.solver.until:
+        if warm.judgement.verdict is Verdict.ACCEPTED or began_anew or self._is_late:
             return warm
         return min(warm, self.register(cloud), key=badness)
 
@@ -536,7 +544,7 @@ class Registrar:
         begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
         found = self._from_rest(*begun)
         for left in reversed(range(gathering.rounds)):
-            if self._is_hopeless(found):
+            if self._is_hopeless(found) or self._is_late:
                 break
             prepared = self._gathered(prepared.forces.forces(found.trial.coefficients[: prepared.forces.size]))
             found = _after(found, self._from_rest(few if left else points, prepared, solver))

@@ -65,3 +65,24 @@ def test_more_time_gives_no_worse_an_answer(body: Body, model: Ticking, rng, sol
     assert errors[0] > 10.0 * errors[-1] and errors[-1] < 2.0 * doubt
     assert (np.diff(solved) >= 0).all() and solved[0] < 0.5 * solved[-1]
     assert found.outcome is Outcome.CONVERGED
+
+
+def test_a_search_from_rest_that_has_no_time_leaves_the_frame_that_followed(body: Body, model: Ticking, rng) -> None:
+    """Noise that jumps may mean that forces act elsewhere now, which only a search from rest would tell."""
+    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
+    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 2.0, least=1e-4))
+    registrar = Registrar(model, SurfaceDistance(body, body.surfaces["observed"]), forces, RegistrationOptions())
+    quiet, loud = (cloud_on(body, truth, 400, rng, noise) for noise in (3e-4, 1e-3))
+    last = registrar.register(quiet)
+    model.now = 0.0
+    whole = registrar.register(loud, last)
+    needed = model.now
+    assert whole.prepared is not last.prepared and needed > 10.0
+    for budget in range(3, int(needed)):
+        model.now = 0.0
+        found = registrar.limited(float(budget)).register(loud, last)
+        assert model.now <= budget + 2.0  # the state that was begun, and what stands at the end of each search
+        if budget > 4:
+            assert found.judgement.verdict is Verdict.ACCEPTED, found.judgement.reasons
+            error = float(np.linalg.norm(found.displacement - truth, axis=1).mean())
+            assert error < 2.0 * found.uncertainty.deviation.mean()
