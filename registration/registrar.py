@@ -413,7 +413,7 @@ class Registrar:
         now = time.monotonic()
         hurried = self.limited(now + _SEARCHING * (self.options.solver.until - now))
         cold = hurried._cold(points, begin)
-        return min(result, cold, key=badness) if cold.outcome is Outcome.OUT_OF_TIME else cold
+        return min(result, cold, key=badness) if hurried._is_late else cold
 
     @property
     def _is_late(self) -> bool:
