@@ -412,8 +412,7 @@ class Registrar:
             return result
         now = time.monotonic()
         hurried = self.limited(now + _SEARCHING * (self.options.solver.until - now))
-        cold = hurried._cold(points, begin)
-        return min(result, cold, key=badness) if hurried._is_late else cold
+        return hurried._cold(points, begin, result)
 
     @property
     def _is_late(self) -> bool:
@@ -537,8 +536,11 @@ class Registrar:
         error = replace(self.error, size=doubt * float(moved))
         return replace(plain, error=error, noise=self.options.noise)
 
-    def _cold(self, points: Cloud, begin: float) -> Registration:
-        """From rest; where the place of the forces is unknown, once more for each round of gathering them."""
+    def _cold(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
+        """From rest; where the place of the forces is unknown, once more for each round of gathering them.
+
+        Where time is over before the end, the better one of this and what is known; that at once, if it is accepted.
+        """
         prepared, gathering, solver = self._everywhere, self.options.gathering, self.options.solver
         few, is_gathered = points.thinned(gathering.points), gathering.rounds > 0
         begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
@@ -548,7 +550,10 @@ class Registrar:
                 break
             prepared = self._gathered(prepared.forces.forces(found.trial.coefficients[: prepared.forces.size]))
             found = _after(found, self._from_rest(few if left else points, prepared, solver))
-        return self._finished(points, prepared, found, begin, is_gathered)
+        if known is not None and self._is_late and known.judgement.verdict is Verdict.ACCEPTED:
+            return known
+        cold = self._finished(points, prepared, found, begin, is_gathered)
+        return cold if known is None or not self._is_late else min(known, cold, key=badness)
 
     def _from_rest(self, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> Found:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
