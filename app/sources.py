@@ -122,6 +122,18 @@ class Feed:
     told: Callable[[], str] = lambda: ""
 
 
+def watched(folder: Path, scene: Scene, idle: float | None, say: Callable[[str], None]) -> WatchedFolder:
+    """The clouds that are written into a folder, in the unit and axes that a scene says of them.
+
+    Args:
+        folder: to look into.
+        scene: unit and axes of the clouds, and whether their normals are wanted.
+        idle: seconds without anything new after which it ends; never if not given.
+        say: prints a line.
+    """
+    return WatchedFolder(folder, lambda path: CloudFile(path, scene.outside, scene.normals), idle=idle, say=say)
+
+
 @contextmanager
 def opened(
     source: Path | Address,
@@ -145,11 +157,7 @@ def opened(
     """
     check_idle(idle)
     if isinstance(source, Path):
-
-        def read(path: Path) -> CloudFile:
-            return CloudFile(path, scene.outside, scene.normals)
-
-        yield Feed(fed(WatchedFolder(source, read, idle=idle, say=say)))
+        yield Feed(fed(watched(source, scene, idle, say)))
         return
     if scene.normals:
         raise ConfigError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -152,18 +152,19 @@ class WatchedFolder:
         self._clock, self._sleep, self._say = clock, sleep, say
 
     def __iter__(self) -> Iterator[CloudFile]:
-        given: set[Path] = set()
+        given: dict[Path, tuple[int, int]] = {}
         seen: dict[Path, tuple[int, int]] = {}
         last, is_there = self._clock(), True
         while True:
-            now = self._look(given)
             if is_there != self._folder.is_dir():
                 is_there = not is_there
                 self._say(f"{self._folder}: there again" if is_there else f"{self._folder}: no such folder, waiting")
-                given.clear()
+                if is_there:
+                    given = {path: state for path, state in self._look({}).items() if given.get(path) == state}
+            now = self._look(given)
             whole = [path for path, state in now.items() if seen.get(path) == state]
             for path in sorted(whole, key=lambda path: by_numbers(str(path))):
-                given.add(path)
+                given[path] = now[path]
                 yield self._read(path)
             if now != seen or whole:
                 last = self._clock()
@@ -172,7 +173,7 @@ class WatchedFolder:
             seen = {path: state for path, state in now.items() if path not in given}
             self._sleep(self._every)
 
-    def _look(self, given: set[Path]) -> dict[Path, tuple[int, int]]:
+    def _look(self, given: Container[Path]) -> dict[Path, tuple[int, int]]:
         """Size and time of the files that were not given yet."""
         found: dict[Path, tuple[int, int]] = {}
         try:

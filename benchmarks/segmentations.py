@@ -44,7 +44,9 @@ def true_surfaces() -> dict[str, tuple[Surface, bool]]:
     body = liver_phantom(0.004)
     found = {"phantom": (body.boundary_surface, True), "phantom, portal vein": (body.inner["vessel_portal"], False)}
     for name in STRANGERS:
-        if (SURFACES / name).is_file():
+        if not (SURFACES / name).is_file():
+            print(f"skipped: no {name} in {SURFACES}")
+        else:
             mesh = read_mesh(SURFACES / name, FILES[name])
             found[name] = (mesh if isinstance(mesh, Surface) else Body(*mesh, {}).boundary_surface, True)
     return found

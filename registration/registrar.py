@@ -472,7 +472,7 @@ class Registrar:
             reduced = self._reduced(fast, problem.forces)
             cheap = replace(problem, model=Anchored.at(reduced, self.observed.nodes, place, near.state))
             way = solver.solve(cheap, near.coefficients, cheap.begun(near.coefficients))
-            if not way.trace or time.monotonic() >= solver.until:
+            if not way.trace or self._is_late:
                 break
             try:
                 near = problem.trial(way.trial.coefficients, replace(way.trial, state=near.state))

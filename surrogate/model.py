@@ -22,6 +22,7 @@ from .maps import LinearMaps
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+_REMEMBERED = 256  # columns of forces
 
 
 class SurrogateState:
@@ -224,10 +225,15 @@ class Surrogate:
         Raises:
             ValueError: see `SurrogateState.push`.
         """
-        if self._pushed is None or not np.array_equal(self._pushed[0], changes):  # each frame asks for the same again
+        known = self._pushed  # read once: another thread may ask for something else
+        if known is None or not np.array_equal(known[0], changes):
             columns = self.at_loaded("changes", changes)
-            self._pushed = np.array(changes, dtype=np.float64), self.maps.linear(columns), self.maps.encoded(columns)
-        return self._pushed[1], self._pushed[2]
+            known = np.array(changes, dtype=np.float64), self.maps.linear(columns), self.maps.encoded(columns)
+            if (
+                columns.shape[1] <= _REMEMBERED
+            ):  # each frame asks for the same, a whole Jacobian is asked for once
+                self._pushed = known
+        return known[1], known[2]
 
     def with_card(self, **entries: Any) -> Surrogate:
         """The same surrogate with more entries in its card, for instance held-out errors."""

@@ -10,9 +10,9 @@ from softtwin.meshes.files import Axes, Unit
 
 from ..config import ConfigError
 from ..record import NOTICE
-from ..register import CloudFile, Scene, Start
-from ..sources import Address, check_idle
-from ..streams import Cloud, Mailbox, WatchedFolder
+from ..register import Scene, Start
+from ..sources import Address, check_idle, watched
+from ..streams import Cloud, Mailbox
 from ..twin import Camera, Home, find_twin
 from .camera import Shot
 from .demo import run_until_interrupted
@@ -41,7 +41,7 @@ def clouds_of(source: Path | Address, scene: Scene, idle: float | None = None, s
         return _heard(source, scene, idle, say)
     if not source.is_dir():
         raise ConfigError(f"SOURCE: expected a folder that clouds are written into, or igtl://..., got {source}.")
-    return WatchedFolder(source, lambda path: CloudFile(path, scene.outside, scene.normals), idle=idle, say=say)
+    return watched(source, scene, idle, say)
 
 
 def _heard(address: Address, scene: Scene, idle: float | None, say: Say) -> Iterator[Cloud]:

@@ -144,6 +144,8 @@ def test_a_folder_that_disappears_is_said_and_waited_for(tmp_path: Path) -> None
     def write() -> None:
         folder.mkdir()
         (folder / "Wolke 1.xyz").write_text("0 0 0\n")
+        (folder / "kept.xyz").write_text("0 0 0\n")
+        os.utime(folder / "kept.xyz", ns=(1, 1))  # it comes back as it was
 
     def sleep(seconds: float) -> None:
         looks[0] += 1
@@ -155,7 +157,7 @@ def test_a_folder_that_disappears_is_said_and_waited_for(tmp_path: Path) -> None
 
     write()
     source = WatchedFolder(folder, lambda path: CloudFile(path, Coordinates()), 0.1, 1.0, clock, sleep, said.append)
-    assert [file.path.name for file in source] == ["Wolke 1.xyz", "Wolke 1.xyz"]
+    assert [file.path.name for file in source] == ["Wolke 1.xyz", "kept.xyz", "Wolke 1.xyz"]
     assert said == [f"{folder}: no such folder, waiting", f"{folder}: there again"]
 
 
