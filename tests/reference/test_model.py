@@ -164,6 +164,17 @@ def test_a_small_step_is_taken_along_the_tangent(box: Body) -> None:
     assert near.equilibrium.iterations <= 2 < cold.equilibrium.iterations
 
 
+def test_a_following_state_is_found_with_the_factorisation_of_the_one_before(box: Body) -> None:
+    with Problem(box, NeoHookean(5000.0, 0.4)) as problem:
+        model = ReferenceModel(problem)
+        state = model.solve(tip_force(box, 0.4))
+        state.push(tip_force(box).reshape(-1, 1))  # factored there
+        near, alone = model.solve(tip_force(box, 0.402), near=state), model.solve(tip_force(box, 0.402))
+    assert isinstance(near, ReferenceState)
+    assert near.equilibrium.factorisations == 0 < alone.equilibrium.factorisations
+    np.testing.assert_allclose(near.displacement, alone.displacement, atol=1e-7)
+
+
 def test_another_models_state_is_a_start(box: Body) -> None:
     """A surrogate's, for instance: all that is asked of it is its displacement."""
     forces = tip_force(box, 0.8)
