@@ -229,9 +229,7 @@ class Surrogate:
         if known is None or not np.array_equal(known[0], changes):
             columns = self.at_loaded("changes", changes)
             known = np.array(changes, dtype=np.float64), self.maps.linear(columns), self.maps.encoded(columns)
-            if (
-                columns.shape[1] <= _REMEMBERED
-            ):  # each frame asks for the same, a whole Jacobian is asked for once
+            if columns.shape[1] <= _REMEMBERED:  # each frame asks for the same, a whole Jacobian is asked for once
                 self._pushed = known
         return known[1], known[2]
 
