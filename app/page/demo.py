@@ -37,12 +37,16 @@ def run_demo(
     home, states = find_twin(PHANTOM), TrueStates.read(PHANTOM)
     with serving(port, "softtwin demo") as server:
         session = Session(server, home, is_simulated=True)
-        say(f"softtwin demo: {address(server)}   (Ctrl-C ends it). {NOTICE}")
-        if record is not None:
-            session.record(seconds, _written(record, session, say))
-        elif browser and not open_browser(server):
-            say("no display here: open that address in a browser on this machine, or through an ssh tunnel.")
-        run_until_interrupted(lambda: session.run(simulated(session, home, states)), say)
+
+        def show() -> None:
+            say(f"softtwin demo: {address(server)}   (Ctrl-C ends it). {NOTICE}")
+            if record is not None:
+                session.record(seconds, _written(record, session, say))
+            elif browser and not open_browser(server):
+                say("no display here: open that address in a browser on this machine, or through an ssh tunnel.")
+            session.run(simulated(session, home, states))
+
+        run_until_interrupted(show, say)
 
 
 def run_until_interrupted(work: Callable[[], None], say: Say) -> None:

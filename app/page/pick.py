@@ -268,10 +268,10 @@ def run_pick(
     subject = subject_of(section, root, configuration)
     with serving(port, "softtwin pick") as server:
         picker = Picker(server, subject, say)
-        say(f"softtwin pick: {address(server)}   (Ctrl-C ends it). {NOTICE}")
-        if browser:
-            open_browser(server)
         try:
+            say(f"softtwin pick: {address(server)}   (Ctrl-C ends it). {NOTICE}")
+            if browser:
+                open_browser(server)
             threading.Event().wait()
         except KeyboardInterrupt:
             say(f"\n--fixed '{picker.words}'" if picker.words else "\nnothing was picked.")

@@ -132,7 +132,11 @@ def _show(
     engine = str(options.get("model") or home.config.registration.model)
     with serving(port, "softtwin live") as server:
         session = Session(server, home, options=chosen, camera=camera, engine=engine)
-        say(f"softtwin live: {address(server)}   (Ctrl-C ends it). {NOTICE}")
-        if browser:
-            open_browser(server)
-        run_until_interrupted(lambda: session.run(Shot(cloud) for cloud in clouds), say)
+
+        def show() -> None:
+            say(f"softtwin live: {address(server)}   (Ctrl-C ends it). {NOTICE}")
+            if browser:
+                open_browser(server)
+            session.run(Shot(cloud) for cloud in clouds)
+
+        run_until_interrupted(show, say)

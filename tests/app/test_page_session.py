@@ -15,7 +15,7 @@ from softtwin.app.config import ConfigError
 from softtwin.app.page import server as page_server
 from softtwin.app.page.camera import Shot, TrueStates, View, shot
 from softtwin.app.page.controls import Controls
-from softtwin.app.page.demo import PHANTOM
+from softtwin.app.page.demo import PHANTOM, run_demo
 from softtwin.app.page.figures import Figures
 from softtwin.app.page.session import Session
 from softtwin.app.page.stream import clouds_of, run_live, show
@@ -79,6 +79,23 @@ def test_an_iterator_of_clouds_is_shown_without_a_truth(told: list[Figures]) -> 
     assert found.verdict is Verdict.ACCEPTED
     assert not found.errors and np.isfinite(found.margins["tumour"])
     assert found.frame_time > 0 and found.age >= found.frame_time
+
+
+@pytest.mark.parametrize(
+    "opened",
+    [lambda say: run_demo(browser=False, say=say), lambda say: show(PHANTOM, [], browser=False, say=say)],
+    ids=["demo", "live"],
+)
+def test_ctrl_c_the_moment_the_address_is_said_closes_the_page(opened: Any) -> None:
+    said = list[str]()
+
+    def say(line: str) -> None:
+        said.append(line)
+        if len(said) == 1:
+            raise KeyboardInterrupt
+
+    opened(say)
+    assert "http://" in said[0] and said[1:] == ["\nthe page is closed."]
 
 
 def test_the_organ_that_is_shown_is_the_one_that_was_registered(told: list[Figures]) -> None:
