@@ -15,6 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 from softtwin.reference.data.outcome import NotConverged
 
 from . import marks
+from .correlated import find_correlated
 from .evidence import Scales, find_scales, linearised
 from .independence import inflation
 from .loss import Huber, Loss, Tukey, robust_deviation
@@ -433,7 +434,19 @@ class LocalModel:
         """
         count = self.problem.forces.size
         told = (self.information + self.normal_information) / alike + self.mark_information
-        return posterior(told, self.precision, self.trial.coefficients, self.scales, count)
+        noise = self.problem.noise_part
+        return posterior(told, self.precision, self.trial.coefficients, self.scales, count, noise)
+
+    def correlated(self, worth: float) -> tuple[float, float] | None:
+        """Size and length of the noise that neighbours share, metres; None where the cloud does without.
+
+        Args:
+            worth: least logarithm of the odds for it.
+        """
+        problem = self.problem
+        weights = np.clip(self.weights, 0.0, 1.0)
+        linear = problem.linear(self.trial, self.jacobian, self.noise, weights)
+        return find_correlated(linear, problem.noise, problem.forces.scale, worth)
 
     def alike(self) -> float:
         """How many points tell what one would that errs by itself, as the residuals here have it; see `inflation`."""

@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 
 from .cloud import Cloud
 from .conditions import Conditions
+from .correlated import CorrelatedNoise, Linear
 from .evidence import Scale
 from .forward import ConditionedModel, ConditionedState, ReducedModel, ReducedState
 from .marks import Marks
@@ -21,6 +22,7 @@ from .residuals import Match, SurfaceDistance
 from .unknowns import Forces, ModelError, PosePrior
 
 Floats = NDArray[np.float64]
+_COUNTED = 0.2  # weight: points with less are outliers
 _WATCHED = 300  # nodes whose movement limits a step
 # Radians, of a measured normal across itself: cameras' are off by some 10 degrees, and flat triangles by some more.
 NORMAL_DEVIATION = float(np.deg2rad(10.0))
@@ -31,7 +33,7 @@ class Trial:
     """The problem at one set of coefficients.
 
     Args:
-        coefficients: of forces, pose, conditions and model error, (k,).
+        coefficients: of forces, pose, conditions, correlated noise and model error, (k,).
         state: the body's state as the model has it.
         positions: displacement of the observed nodes with the model's error, (m, 3), metres.
         pose: from the body's coordinates to the cloud's; None where it is not unknown.
@@ -64,6 +66,7 @@ class Problem:
         across: two unit vectors across each point's measured normal, in the cloud's coordinates, (p, 2, 3): how far the
             surface leans towards them pulls, too; None for a cloud without normals.
         leaning: standard deviation of that, radians.
+        correlated: noise that neighbouring points share, as unknowns; None where each point errs by itself.
     """
 
     model: ReducedModel
@@ -77,6 +80,7 @@ class Problem:
     marks: Marks | None = None
     across: Floats | None = None
     leaning: float = NORMAL_DEVIATION
+    correlated: CorrelatedNoise | None = None
 
     @classmethod
     def seen(cls, cloud: Cloud, **given: Any) -> Problem:
@@ -90,8 +94,8 @@ class Problem:
 
     @property
     def size(self) -> int:
-        """Number of coefficients: those of the forces, of the pose, of conditions, of the model's error."""
-        return self.condition_part.stop + (0 if self.error is None else self.error.count)
+        """Number of coefficients: of the forces, the pose, conditions, correlated noise and the model's error."""
+        return self.noise_part.stop + (0 if self.error is None else self.error.count)
 
     @cached_property
     def force_part(self) -> slice:
@@ -110,9 +114,65 @@ class Problem:
         return slice(begin, begin + (0 if self.conditions is None else self.conditions.count))
 
     @cached_property
+    def noise_part(self) -> slice:
+        """Where those of the correlated noise are."""
+        begin = self.condition_part.stop
+        return slice(begin, begin + (0 if self.correlated is None else self.correlated.count))
+
+    @cached_property
     def error_part(self) -> slice:
         """Where those of the model's error are."""
-        return slice(self.condition_part.stop, None)
+        return slice(self.noise_part.stop, None)
+
+    @cached_property
+    def _shared(self) -> Floats:
+        """What each coefficient of the correlated noise adds to the distances, (p, q), metres."""
+        return np.zeros((len(self.cloud), 0)) if self.correlated is None else self.correlated.patterns(self.cloud)
+
+    def shared_noise(self, trial: Trial) -> Floats:
+        """The part of the distances that is taken for noise that neighbours share, (p,), metres."""
+        found: Floats = self._shared @ trial.coefficients[self.noise_part]
+        return found
+
+    def carried(self, coefficients: Floats, before: Problem) -> Floats:
+        """Coefficients of another problem for a start of this one, (k,); what it did not have is zero.
+
+        Args:
+            coefficients: of the other problem.
+            before: that problem, of the same kinds of forces, pose and conditions.
+        """
+        start = np.zeros(self.size)
+        start[: self.condition_part.stop] = coefficients[: before.condition_part.stop]
+        mine, other = self.correlated, before.correlated
+        if mine is not None and other is not None and mine.centres is other.centres:
+            start[self.noise_part] = coefficients[before.noise_part]
+        errors = coefficients[before.error_part]
+        if len(errors) == self.size - self.noise_part.stop:
+            start[self.error_part] = errors
+        return start
+
+    def linear(self, trial: Trial, jacobian: Floats, noise: float, weights: Floats) -> Linear:
+        """The distances, linear in the unknowns about a trial, without correlated noise.
+
+        Args:
+            trial: where.
+            jacobian: derivative of the distances there, (p, k).
+            noise: standard deviation of a point's distance, metres.
+            weights: of the points, (p,); those with little are left out.
+        """
+        kept, coefficients = weights > _COUNTED, trial.coefficients.copy()
+        coefficients[self.noise_part] = 0.0
+        distances = self.residuals(trial, noise) + self.shared_noise(trial)
+        columns = np.arange(self.size)
+        others = np.setdiff1d(columns[self.force_part.stop :], columns[self.noise_part])
+        return Linear(
+            self.cloud[kept],
+            (jacobian @ coefficients - distances)[kept],
+            jacobian[kept][:, self.force_part],
+            jacobian[kept][:, others],
+            self.left_out(trial)[kept],
+            weights[kept],
+        )
 
     def trial(self, coefficients: Floats, near: Trial | None = None, *, anew: bool = False) -> Trial:
         """The problem at some coefficients.
@@ -173,13 +233,14 @@ class Problem:
         return np.sqrt(alike) * self.observed.at_points(trial.match, self.error.rest)
 
     def residuals(self, trial: Trial, noise: float) -> Floats:
-        """Distances less what they are in the mean for points of some noise, (p,), metres.
+        """Distances less what they are in the mean for points of some noise, and less shared noise, (p,), metres.
 
         Args:
             trial: at some coefficients.
             noise: standard deviation of each coordinate of a point, metres.
         """
-        return trial.match.distances - self.observed.expected(trial.match, noise)
+        expected = self.observed.expected(trial.match, noise)
+        return trial.match.distances - expected - self.shared_noise(trial)
 
     def again(self, trial: Trial, beyond: float = 0.0) -> Trial:
         """The same trial with closest points searched anew.
@@ -191,14 +252,16 @@ class Problem:
         return replace(trial, match=self.observed.match_beyond(trial.positions, trial.cloud, trial.match, beyond))
 
     def jacobian(self, trial: Trial) -> Floats:
-        """Derivative of the distances by the coefficients, (p, k), exact."""
+        """Derivative of the residuals by the coefficients, (p, k), exact."""
         rows = self.observed.rows(trial.match)
-        return self._by_coefficients(trial, rows, self._by_pose(trial, trial.match.directions, trial.cloud))
+        by_pose = self._by_pose(trial, trial.match.directions, trial.cloud)
+        return self._by_coefficients(trial, rows, by_pose, -self._shared)
 
     def pulled(self, trial: Trial, cotangent: Floats) -> Floats:
-        """Gradient by the coefficients, (k,), from the one by the distances, (p,): J^T g with the adjoint."""
+        """Gradient by the coefficients, (k,), from the one by the residuals, (p,): J^T g with the adjoint."""
         rows = self.observed.rows(trial.match)
-        return self._pulled(trial, rows, self._by_pose(trial, trial.match.directions, trial.cloud), cotangent)
+        by_pose = self._by_pose(trial, trial.match.directions, trial.cloud)
+        return self._pulled(trial, rows, by_pose, cotangent, -self._shared)
 
     def mark_residuals(self, trial: Trial) -> Floats:
         """Coordinates of the landmarks less where they were found, over their deviation, (3l,), body's axes."""
@@ -276,18 +339,24 @@ class Problem:
         axes = np.tile(np.eye(3) / self.marks.deviation, (len(self.marks), 1))
         return self._by_pose(trial, axes, np.repeat(self._found_marks(trial), 3, axis=0))
 
-    def _by_coefficients(self, trial: Trial, rows: csr_array, by_pose: Floats | None) -> Floats:
+    def _by_coefficients(
+        self, trial: Trial, rows: csr_array, by_pose: Floats | None, by_noise: Floats | None = None
+    ) -> Floats:
         """Derivative of linear functions of the observed nodes' displacement, (q, k), for rows (q, 3m)."""
         blocks = [trial.state.jacobian(rows)]
         if by_pose is not None:
             blocks.append(by_pose)
         if self.conditions is not None:
             blocks.append(cast(ConditionedState, trial.state).rows_by_conditions(rows))
+        if self.correlated is not None:
+            blocks.append(np.zeros((rows.shape[0], self.correlated.count)) if by_noise is None else by_noise)
         if self.error is not None:
             blocks.append(self.error.jacobian(rows))
         return np.hstack(blocks)
 
-    def _pulled(self, trial: Trial, rows: csr_array, by_pose: Floats | None, cotangent: Floats) -> Floats:
+    def _pulled(
+        self, trial: Trial, rows: csr_array, by_pose: Floats | None, cotangent: Floats, by_noise: Floats | None = None
+    ) -> Floats:
         """The same, transposed and applied, (k,)."""
         by_nodes = (rows.T @ cotangent).reshape(-1, 3)
         full = np.zeros_like(self.observed.body.points)
@@ -297,6 +366,8 @@ class Problem:
             blocks.append(cotangent @ by_pose)
         if self.conditions is not None:
             blocks.append(full.ravel() @ cast(ConditionedState, trial.state).by_conditions())
+        if self.correlated is not None:
+            blocks.append(np.zeros(self.correlated.count) if by_noise is None else cotangent @ by_noise)
         if self.error is not None:
             blocks.append(self.error.jacobian(by_nodes.ravel()))
         return np.concatenate(blocks)

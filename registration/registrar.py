@@ -20,9 +20,10 @@ from softtwin.reference.data.outcome import NotConverged
 from .anchored import Anchored
 from .cloud import Cloud
 from .conditions import Conditions, Estimate
+from .correlated import CorrelatedNoise
 from .evidence import Scale
 from .forward import ForwardModel, ReducedModel, State, reduce_model
-from .gauss_newton import Found, GaussNewton, Step
+from .gauss_newton import Found, GaussNewton, LocalModel, Step
 from .lbfgs import LBFGS
 from .loss import robust_deviation
 from .marks import Marks
@@ -46,6 +47,10 @@ _LEFT = 1.5  # times the noise of the frame before
 _SEARCHING = 0.7  # of the time that is left for a frame: the search from rest, whose end takes the others
 _DOUBTS, _SURE = 3, 0.1  # times that the model's error is scaled anew; not where that changes it by less
 _MISSED, _EXPLAINED = 1.0, 0.5  # times the least noise, shared by neighbours; part of it that forces anywhere leave
+_ALIKE = 0.2  # part of what a cloud has left that neighbours share: with less, nobody asks for correlated noise
+_A_TRY, _WORTH = -3.0, 5.0  # of the logarithm of the odds of correlated noise: for a try, and to be believed
+_TRIES, _SAME = 3, 0.15  # of finding its size and length; of their logarithms, less than which is no change
+_GONE = 1.0  # times the least noise: correlated noise that small is not looked for in the next frame
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
 _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
@@ -193,6 +198,8 @@ class Registration:
         trace: one entry an iteration.
         problem: what was solved, for the cloud and the model's error as they were taken in the end.
         posterior: of the coefficients.
+        local: the objective's model there.
+        was_looked_for: whether noise that neighbours share was looked for, here or before, and not found.
         draft: what a faster model had found, where this one went on from there.
     """
 
@@ -219,6 +226,8 @@ class Registration:
     trace: tuple[Step, ...]
     problem: Problem
     posterior: Posterior
+    local: LocalModel
+    was_looked_for: bool = False
     draft: Registration | None = None
 
     @property
@@ -318,6 +327,7 @@ class Registrar:
         self.conditions, self.modulus_deviation = conditions, 0.0 if is_found else modulus_deviation
         self.anywhere = None if anywhere is None else cache(anywhere)  # made when it is first asked for
         self.marks: Marks | None = None
+        self.correlated: CorrelatedNoise | None = None
         self.options = options or RegistrationOptions()
         discrepancy = model.discrepancy
         self.error = None if discrepancy is None else ModelError.of(discrepancy, observed.nodes)
@@ -360,6 +370,16 @@ class Registrar:
         other.marks = marks
         return other
 
+    def believing(self, correlated: CorrelatedNoise | None) -> Registrar:
+        """The same with noise that the points of a cloud share, or without.
+
+        Args:
+            correlated: of the cloud that comes; None for points that err each by itself.
+        """
+        other = copy.copy(self)
+        other.correlated = correlated
+        return other
+
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud.
 
@@ -397,22 +417,55 @@ class Registrar:
         begin = time.perf_counter()
         points = self._checked(cloud)
         if start is None:
-            return self._cold(points, begin)
+            return self._afresh(points, begin)
+        like = self.believing(_still_there(start.problem.correlated, points))
+        result = like._followed(points, start, begin)
+        if start.prepared is not self._everywhere and self._has_left(result, start) and not self._is_late:
+            now = time.monotonic()
+            hurried = self.limited(now + _SEARCHING * (self.options.solver.until - now))
+            return hurried._afresh(points, begin, result)
+        if start.was_looked_for:
+            return replace(result, was_looked_for=True)
+        return like._told_apart(result, lambda other, near: other._sought_anew(points, near, begin))
+
+    def _afresh(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
+        """From rest, and once more where neighbours are found to share noise; see `_cold`."""
+        found = self._cold(points, begin, known)
+        return found if found is known else self._told_apart(found, lambda other, near: other._sought_anew(points, near, begin))
+
+    def _followed(self, points: Cloud, start: Registration, begin: float) -> Registration:
+        """From the frame before, or from rest with its forces."""
         problem = self._problem(points, start.prepared, start.trial, start.doubt)
-        near = problem.begun(start.trial.coefficients.copy(), start.trial)
+        near = problem.begun(problem.carried(start.trial.coefficients, start.problem), start.trial)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
             found = self._from_rest(points, start.prepared, self.options.solver)
-            result = self._finished(points, start.prepared, found, begin)
-        else:
-            solver = self.options.solver.following()
-            found = solver.solve(problem, near.coefficients, near)
-            problem, found, doubt = self._doubted(problem, found, start.doubt, solver)
-            result = self._result(problem, found, start.prepared, begin, doubt)
-        if start.prepared is self._everywhere or not self._has_left(result, start) or self._is_late:
-            return result
-        now = time.monotonic()
-        hurried = self.limited(now + _SEARCHING * (self.options.solver.until - now))
-        return hurried._cold(points, begin, result)
+            return self._finished(points, start.prepared, found, begin)
+        solver = self.options.solver.following()
+        found = solver.solve(problem, near.coefficients, near)
+        problem, found, doubt = self._doubted(problem, found, start.doubt, solver)
+        return self._result(problem, found, start.prepared, begin, doubt)
+
+    def _told_apart(self, found: Registration, again: Callable[[Registrar, Registration], Registration]) -> Registration:
+        """The result; where its cloud has noise that neighbours share, what is found with that in mind.
+
+        Forces have explained such noise as far as they can: only where it is left to itself it is seen as it is, so
+        that a guess is good enough for a second try, and that one decides.
+        """
+        if found.problem.correlated is not None or not _is_shared(found, self.noise.least):
+            return found
+        told, best = found.local.correlated(_A_TRY), found
+        for _ in range(_TRIES):
+            if told is None:
+                break
+            if self._is_late:
+                return _out_of_time(best, told)
+            other = again(self.believing(CorrelatedNoise.over(found.problem.cloud, *told)), best)
+            before, told = told, other.local.correlated(_WORTH)
+            if told is not None:
+                best = other
+                if np.abs(np.log(np.divide(told, before))).max() < _SAME:
+                    break
+        return replace(best, was_looked_for=best is found)
 
     @property
     def _is_late(self) -> bool:
@@ -437,9 +490,22 @@ class Registrar:
             NotConverged: the model found no state there.
         """
         begin = time.perf_counter()
-        points, solver = self._checked(cloud), self.options.solver.following()
+        points = self._checked(cloud)
+        noise = draft.problem.correlated
+        if noise is None and last is not None:
+            noise = _still_there(last.problem.correlated, points)
+        like = self.believing(noise)
+        found = like._refined(points, draft, fast, last, begin)
+        if not draft.was_looked_for:
+            found = like._told_apart(found, lambda other, _: other._refined(points, draft, fast, None, begin))
+        return replace(found, draft=draft)
+
+    def _refined(
+        self, points: Cloud, draft: Registration, fast: ForwardModel, last: Registration | None, begin: float
+    ) -> Registration:
+        solver = self.options.solver.following()
         if last is not None and last.draft is not None and last.draft.prepared is draft.prepared:
-            return replace(self._carried_on(points, fast, last, begin), draft=draft)
+            return self._carried_on(points, fast, last, begin)
         # Told a zone, the exact model gathers no forces within it, and takes none that were: see `options_for`.
         prepared = self._everywhere
         if self.options.gathering.rounds:
@@ -448,13 +514,16 @@ class Registrar:
         start = np.zeros(problem.size)
         start[problem.force_part] = prepared.forces.nearest(draft.unknown_forces)
         start[problem.pose_part] = draft.coefficients[draft.problem.pose_part]
+        if draft.problem.correlated is self.correlated:
+            start[problem.noise_part] = draft.coefficients[draft.problem.noise_part]
         found = self._approached(problem, problem.begun(start, draft.trial), fast, solver)
-        return replace(self._finished(points, prepared, found, begin), draft=draft)
+        return self._finished(points, prepared, found, begin)
 
     def _carried_on(self, points: Cloud, fast: ForwardModel, last: Registration, begin: float) -> Registration:
         problem = self._problem(points, last.prepared, last.trial, last.doubt)
         solver = self.options.solver.following()
-        found = self._approached(problem, last.trial, fast, solver)
+        near = replace(last.trial, coefficients=problem.carried(last.trial.coefficients, last.problem))
+        found = self._approached(problem, near, fast, solver)
         problem, found, doubt = self._doubted(problem, found, last.doubt, solver)
         return self._result(problem, found, last.prepared, begin, doubt)
 
@@ -525,6 +594,7 @@ class Registrar:
             conditions=self.conditions,
             marks=self.marks,
             leaning=self.options.normal_deviation,
+            correlated=self.correlated,
         )
 
     def _problem(self, points: Cloud, prepared: Prepared, near: Trial, doubt: float = 1.0) -> Problem:
@@ -555,6 +625,26 @@ class Registrar:
         cold = self._finished(points, prepared, found, begin, is_gathered)
         return cold if known is None or not self._is_late else min(known, cold, key=badness)
 
+    def _sought_anew(self, points: Cloud, near: Registration, begin: float) -> Registration:
+        """From a result that took noise that neighbours share for forces: where they act is sought once more."""
+        prepared, nodal, trial, solver = self._everywhere, near.unknown_forces, near.trial, self.options.solver
+        spent: list[Found] = []
+        for left in reversed(range(self.options.gathering.rounds + 1)):
+            problem = self._plain(points, prepared)
+            start = problem.carried(near.coefficients, near.problem) if prepared is near.prepared else None
+            if start is None:
+                start = np.zeros(problem.size)
+                start[problem.force_part] = prepared.forces.nearest(nodal)
+                for part in ("pose_part", "condition_part"):
+                    start[getattr(problem, part)] = trial.coefficients[getattr(near.problem, part)]
+            found = solver.solve(problem, start, replace(trial, coefficients=start))
+            spent.append(found)
+            nodal, trial = prepared.forces.forces(found.trial.coefficients[problem.force_part]), found.trial
+            if not left:
+                break
+            prepared = self._gathered(nodal)
+        return self._finished(points, prepared, reduce(_after, spent), begin)
+
     def _from_rest(self, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> Found:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
         few, first = points.thinned(self.options.gathering.points), prepared.leading(_LEADING)
@@ -564,6 +654,7 @@ class Registrar:
         start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
         start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
         start[problem.condition_part] = begun.trial.coefficients[rough.condition_part]
+        start[problem.noise_part] = begun.trial.coefficients[rough.noise_part]
         if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
             solver = solver.without_steps()
         return _after(begun, solver.solve(problem, start, begun.trial))
@@ -586,7 +677,7 @@ class Registrar:
         if wider is not believed:  # seen only now that the model's error is told from noise
             believed, problem = wider, replace(problem, forces=wider.forces)
             found = _after(found, solver.solve(problem, found.trial.coefficients, found.trial))
-        if self.error is not None and not is_hopeless:
+        if not is_hopeless:
             problem, found, doubt = self._doubted(problem, found, doubt, self.options.solver.following())
         return self._result(problem, found, believed, begin, doubt)
 
@@ -606,26 +697,26 @@ class Registrar:
     def _doubted(
         self, problem: Problem, found: Found, doubt: float, solver: GaussNewton | LBFGS
     ) -> tuple[Problem, Found, float]:
-        """Once more where the model's error is larger or smaller than its samples said: its scale is found, too.
-
-        The scale is MacKay's (1992): the squares of the unknowns over the number that the cloud tells of them.
-        """
+        """Once more where the model's error, or the noise that neighbours share, is larger or smaller than was said."""
         for _ in range(_DOUBTS):
-            if problem.error is None or not found.outcome.is_success:
+            if not found.outcome.is_success:
                 break
-            unknown = found.trial.coefficients[problem.error_part]
-            variances = np.diag(found.posterior.covariance)[problem.error_part]
-            known = len(unknown) - float(variances.sum())
-            factor = float(np.sqrt((unknown @ unknown + _BELIEF) / (known + _BELIEF)))
-            factor = min(max(factor, _LEAST_DOUBT / doubt), _MOST_DOUBT / doubt)
-            if abs(np.log(factor)) < _SURE:
+            start, was = found.trial.coefficients.copy(), problem
+            if problem.error is not None:
+                factor = _resized(found, problem.error_part)
+                factor = min(max(factor, _LEAST_DOUBT / doubt), _MOST_DOUBT / doubt)
+                if abs(np.log(factor)) >= _SURE:
+                    doubt *= factor
+                    problem = replace(problem, error=replace(problem.error, size=factor * problem.error.size))
+                    start[problem.error_part] /= factor
+            if problem.correlated is not None:
+                factor = _resized(found, problem.noise_part)
+                if np.log(factor) <= -_SURE:  # what is larger is shorter, too: that is looked for from rest
+                    problem = replace(problem, correlated=problem.correlated.resized(factor))
+                    start[problem.noise_part] /= factor
+            if problem is was:
                 break
-            doubt *= factor
-            problem = replace(problem, error=replace(problem.error, size=factor * problem.error.size))
-            start = found.trial.coefficients.copy()
-            start[problem.error_part] /= factor
-            again = solver.last().solve(problem, start, found.trial)
-            found = _after(found, again)
+            found = _after(found, solver.last().solve(problem, start, found.trial))
         return problem, found, doubt
 
     def _gathered(self, nodal: Floats) -> Prepared:
@@ -691,6 +782,7 @@ class Registrar:
             trace=found.trace,
             problem=problem,
             posterior=found.posterior,
+            local=found.local,
         )
 
 
@@ -799,6 +891,40 @@ def expected_force(body: Body, young_modulus: float) -> float:
 def badness(result: Registration) -> tuple[int, float]:
     """By which results for one cloud are ordered, the best first."""
     return list(Verdict).index(result.judgement.verdict), result.noise
+
+
+def _out_of_time(found: Registration, told: tuple[float, float]) -> Registration:
+    """The result, doubtful for noise that there was no time to tell from forces."""
+    size, length = (1e3 * value for value in told)
+    reason = (
+        f"points within {length:.0f} mm of each other err alike, by {size:.1f} mm, and no time was left to tell that "
+        "from forces"
+    )
+    return replace(found, judgement=Judgement(Verdict.DOUBTFUL, (*found.judgement.reasons, reason)))
+
+
+def _resized(found: Found, part: slice) -> float:
+    """Factor by which unknowns of unit variance are larger than was said, or smaller.
+
+    It is MacKay's (1992): the squares of the unknowns over the number that the cloud tells of them.
+    """
+    unknown = found.trial.coefficients[part]
+    known = len(unknown) - float(np.diag(found.posterior.covariance)[part].sum())
+    return float(np.sqrt((unknown @ unknown + _BELIEF) / (known + _BELIEF)))
+
+
+def _is_shared(found: Registration, least: float) -> bool:
+    """Whether neighbours share of what a cloud has left more than the least noise, and more than chance has them."""
+    match = found.trial.match
+    part = shared(found.problem.observed.feet(match), match.distances, np.ones(len(match.distances)))
+    return part > _ALIKE and found.rms_distance * np.sqrt(part) > least
+
+
+def _still_there(correlated: CorrelatedNoise | None, points: Cloud) -> CorrelatedNoise | None:
+    """The noise that neighbours shared in the frame before, for this one's points; None where there was hardly any."""
+    if correlated is None or correlated.size < _GONE * NOISE.least:
+        return None
+    return correlated.of(points.points)
 
 
 def _after(first: Found, second: Found) -> Found:

@@ -139,6 +139,7 @@ def uncertainty(problem: Problem, trial: Trial, posterior: Posterior, unseen: Fl
         rest = problem.error.size * problem.error.discrepancy.rest
     if not np.isfinite(posterior.covariance).all():  # of a cloud that tells nothing that could be believed
         return Uncertainty(np.zeros((3 * len(rest), 1)), np.full(len(rest), np.inf))
-    values, vectors = np.linalg.eigh(posterior.covariance)
+    noise = np.arange(problem.size)[problem.noise_part]  # which moves no node
+    values, vectors = np.linalg.eigh(np.delete(np.delete(posterior.covariance, noise, axis=0), noise, axis=1))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return Uncertainty(np.hstack([np.hstack(blocks) @ root, posterior.scales.force * unseen]), rest)
