@@ -418,9 +418,13 @@ class Registrar:
         points = self._checked(cloud)
         if start is None:
             return self._afresh(points, begin)
-        like = self.believing(_still_there(start.problem.correlated, points))
+        before = start.problem.correlated
+        like = self.believing(_still_there(before, points))
+        if before is not None and like.correlated is None:
+            return self._afresh(points, begin)
         result = like._followed(points, start, begin)
-        if start.prepared is not self._everywhere and self._has_left(result, start) and not self._is_late:
+        may_leave = start.prepared is not self._everywhere or before is not None
+        if may_leave and self._has_left(result, start) and not self._is_late:
             now = time.monotonic()
             hurried = self.limited(now + _SEARCHING * (self.options.solver.until - now))
             return hurried._afresh(points, begin, result)
@@ -431,7 +435,11 @@ class Registrar:
     def _afresh(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
         """From rest, and once more where neighbours are found to share noise; see `_cold`."""
         found = self._cold(points, begin, known)
-        return found if found is known else self._told_apart(found, lambda other, near: other._sought_anew(points, near, begin))
+        return (
+            found
+            if found is known
+            else self._told_apart(found, lambda other, near: other._sought_anew(points, near, begin))
+        )
 
     def _followed(self, points: Cloud, start: Registration, begin: float) -> Registration:
         """From the frame before, or from rest with its forces."""
@@ -445,7 +453,9 @@ class Registrar:
         problem, found, doubt = self._doubted(problem, found, start.doubt, solver)
         return self._result(problem, found, start.prepared, begin, doubt)
 
-    def _told_apart(self, found: Registration, again: Callable[[Registrar, Registration], Registration]) -> Registration:
+    def _told_apart(
+        self, found: Registration, again: Callable[[Registrar, Registration], Registration]
+    ) -> Registration:
         """The result; where its cloud has noise that neighbours share, what is found with that in mind.
 
         Forces have explained such noise as far as they can: only where it is left to itself it is seen as it is, so
@@ -626,24 +636,18 @@ class Registrar:
         return cold if known is None or not self._is_late else min(known, cold, key=badness)
 
     def _sought_anew(self, points: Cloud, near: Registration, begin: float) -> Registration:
-        """From a result that took noise that neighbours share for forces: where they act is sought once more."""
-        prepared, nodal, trial, solver = self._everywhere, near.unknown_forces, near.trial, self.options.solver
-        spent: list[Found] = []
-        for left in reversed(range(self.options.gathering.rounds + 1)):
-            problem = self._plain(points, prepared)
-            start = problem.carried(near.coefficients, near.problem) if prepared is near.prepared else None
-            if start is None:
-                start = np.zeros(problem.size)
-                start[problem.force_part] = prepared.forces.nearest(nodal)
-                for part in ("pose_part", "condition_part"):
-                    start[getattr(problem, part)] = trial.coefficients[getattr(near.problem, part)]
-            found = solver.solve(problem, start, replace(trial, coefficients=start))
-            spent.append(found)
-            nodal, trial = prepared.forces.forces(found.trial.coefficients[problem.force_part]), found.trial
-            if not left:
-                break
-            prepared = self._gathered(nodal)
-        return self._finished(points, prepared, reduce(_after, spent), begin)
+        """From a result that took noise that neighbours share for forces.
+
+        They are not gathered: where noise looks like them, what was found of their place is no belief to build upon.
+        """
+        prepared, before = self._everywhere, near.problem
+        problem = self._plain(points, prepared)
+        start = np.zeros(problem.size)
+        start[problem.force_part] = prepared.forces.nearest(near.unknown_forces)
+        start[problem.pose_part] = near.coefficients[before.pose_part]
+        start[problem.condition_part] = near.coefficients[before.condition_part]
+        found = self.options.solver.solve(problem, start, replace(near.trial, coefficients=start))
+        return self._finished(points, prepared, found, begin)
 
     def _from_rest(self, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> Found:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
@@ -684,7 +688,7 @@ class Registrar:
     def _believed(self, prepared: Prepared, found: Found) -> Prepared:
         """The forces' size as the cloud tells it, where it can: what was expected would call a sharp pull outliers."""
         belief, noise = self.options.belief, found.posterior.scales.noise
-        is_told = noise < belief.clear or noise > belief.loud
+        is_told = (noise < belief.clear or noise > belief.loud) and self.correlated is None
         if not is_told or prepared.forces.scale.spread >= belief.spread:
             return prepared
         return prepared.believing(belief.spread)

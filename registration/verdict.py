@@ -157,13 +157,15 @@ def _of_the_cloud(problem: Problem, found: Found, expected: Expectations) -> lis
 
 def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
     noise, findings = found.posterior.scales.noise, []
+    match = found.trial.match
+    by_patches = problem.shared_noise(found.trial)
+    noise = float(np.hypot(noise, np.sqrt(np.mean(by_patches**2))))
     if noise > expected.noise:
         verdict = Verdict.REFUSED if noise > 1.5 * expected.noise else Verdict.DOUBTFUL
         findings.append(
             (verdict, f"organ and cloud do not match: points lie {1e3 * noise:.1f} mm from the surface "
                       f"(up to {1e3 * expected.noise:.1f} mm could be noise)")
         )  # fmt: skip
-    match = found.trial.match
     systematic = noise  # of which neighbours share a part
     if systematic > expected.systematic:
         systematic *= np.sqrt(shared(problem.observed.feet(match), match.distances, found.weights))
@@ -171,7 +173,7 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
         verdict = Verdict.REFUSED if systematic > 2.0 * expected.systematic else Verdict.DOUBTFUL
         findings.append(
             (verdict, f"organ and cloud do not match: whole patches of the surface are {1e3 * systematic:.1f} mm off, "
-                      f"which no noise explains (up to {1e3 * expected.systematic:.1f} mm is let pass)")
+                      f"which no noise of single points explains (up to {1e3 * expected.systematic:.1f} mm is let pass)")
         )  # fmt: skip
     outliers = float(np.mean(found.weights < 0.05))
     if outliers > expected.outliers:
