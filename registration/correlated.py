@@ -1,8 +1,9 @@
 """Noise that neighbouring points share: whether a cloud has it, how much, over what length, and what it looks like.
 
 A depth camera's noise has patches (multipath, smoothing, calibration). Taken for independent, it can only be explained
-by forces. Here distances err by a smooth field with covariance a^2 exp(-d^2 / 2 l^2) beside each point's own noise, and
-the evidence of both pictures decides (MacKay 1992; the smooth field is the discrepancy of Kennedy and O'Hagan 2001).
+by forces. Here a smooth field of shifts v, each component with covariance a^2 exp(-d^2 / 2 l^2), is added to each
+point's own noise: distances along normals n err by n . v. The evidence of both pictures decides (MacKay 1992; the field
+is the discrepancy of Kennedy and O'Hagan 2001).
 """
 
 from __future__ import annotations
@@ -23,73 +24,92 @@ Floats = NDArray[np.float64]
 _ASKED = 300  # points that the evidence is taken from
 _CHOSEN = 1000  # points among which centres are chosen
 _MOST = 120  # centres
+_ROUND_OFF = 1e-9
+_NEAR = 0.5  # of the correlation
 _LEFT = 0.01  # of the variance at any point is not carried by the centres
 _SIZE, _SIZE_SPREAD = 5e-4, 1.0  # metres, and of its logarithm: what is believed of such noise where there is some
 _LENGTH, _LENGTH_SPREAD = 0.15, 0.5  # of the cloud's extent, and of its logarithm
 _STARTS = 0.5, 1.0, 2.0  # times the length that is believed
+_QUIET, _STRONG = 0.2, 10.0  # of the noise and the forces that are expected: where forces explain the noise
 _EVALUATIONS = 160
+_NEVER = 1e12  # minus the logarithm of the chance of scales with no covariance
 _EXACT = 0.05  # of the logarithms sought
 
 
 @dataclass(frozen=True, eq=False)
 class CorrelatedNoise:
-    """A smooth field of distances, with coefficients of unit variance.
+    """A smooth field that shifts the points of a cloud, seen through their distances, of coefficients of unit variance.
 
     Args:
-        size: standard deviation, metres.
+        size: standard deviation of each component, metres.
         length: over which neighbours share it, metres.
         centres: points that carry it, (q, 3), metres, in the cloud's coordinates.
+        normals: of the surface there, (q, 3), on the same axes.
     """
 
     size: float
     length: float
     centres: Floats
+    normals: Floats
 
     @classmethod
-    def over(cls, points: Floats, size: float, length: float) -> CorrelatedNoise:
+    def over(cls, points: Floats, normals: Floats, size: float, length: float) -> CorrelatedNoise:
         """Noise of a cloud, carried by some of its points: by so many that they tell the others' (pivoted Cholesky).
 
         Args:
             points: (p, 3), metres.
-            size: standard deviation, metres.
+            normals: of the surface there, (p, 3).
+            size: standard deviation of each component, metres.
             length: over which neighbours share it, metres.
         """
-        chosen = points[:: -(-len(points) // _CHOSEN)]
-        _, pivots, rank, _ = dpstrf(_alike(chosen, chosen, length), tol=_LEFT)
-        return cls(size, length, chosen[pivots[: min(int(rank), _MOST)] - 1])
-
-    def of(self, points: Floats) -> CorrelatedNoise:
-        """The same kind of noise of another cloud, (p, 3)."""
-        return self.over(points, self.size, self.length)
+        every = slice(None, None, -(-len(points) // _CHOSEN))
+        points, normals = points[every], normals[every]
+        alike = _nearness(points, points, length) * (normals @ normals.T)
+        _, pivots, rank, _ = dpstrf(alike, tol=_LEFT)
+        chosen = pivots[: min(int(rank), _MOST)] - 1
+        return cls(size, length, points[chosen], normals[chosen])
 
     def resized(self, factor: float) -> CorrelatedNoise:
         """Noise so many times as large, carried by the same points."""
         return replace(self, size=factor * self.size)
+
+    def reaches(self, points: Floats) -> float:
+        """Part of the points that lie about as near to the points that carry it as these do to each other."""
+        return float((_nearness(points, self.centres, self.length).max(axis=1) > _NEAR).mean())
 
     @property
     def count(self) -> int:
         """Number of coefficients."""
         return len(self.centres)
 
-    @cached_property
-    def _root(self) -> Floats:
-        every = _alike(self.centres, self.centres, self.length)
-        every[np.diag_indices(self.count)] += 1e-9
-        return np.asarray(cholesky(every, lower=True))
+    def near(self, points: Floats) -> Floats:
+        """How much noise points have in common with those that carry it, (p, q)."""
+        return _nearness(points, self.centres, self.length)
 
-    def patterns(self, points: Floats) -> Floats:
-        """What each coefficient adds to the distances of points, (p, q), metres.
+    @cached_property
+    def _mixing(self) -> Floats:
+        """From coefficients to weights of the points that carry the noise, (q, q), metres."""
+        alike = _nearness(self.centres, self.centres, self.length) * (self.normals @ self.normals.T)
+        alike[np.diag_indices(self.count)] += _ROUND_OFF
+        return self.size * solve_triangular(cholesky(alike, lower=True), np.eye(self.count), lower=True).T
+
+    def shifts(self, coefficients: Floats, near: Floats, normals: Floats) -> Floats:
+        """What some coefficients, (q,), make of the distances, (p,), metres; see `patterns`."""
+        found: Floats = (near * (normals @ self.normals.T)) @ (self._mixing @ coefficients)
+        return found
+
+    def patterns(self, near: Floats, normals: Floats) -> Floats:
+        """What each coefficient makes of the distances of points, (p, q), metres.
 
         Args:
-            points: of the cloud, (p, 3), metres; all of it or some.
+            near: what `near` says of the points, (p, q).
+            normals: of the surface at them, (p, 3), on the cloud's axes.
         """
-        by_centres = _alike(self.centres, points, self.length)
-        found: Floats = self.size * solve_triangular(self._root, by_centres, lower=True).T
+        found: Floats = (near * (normals @ self.normals.T)) @ self._mixing
         return found
 
 
-def _alike(first: Floats, second: Floats, length: float) -> Floats:
-    """Correlation of the noise of two sets of points."""
+def _nearness(first: Floats, second: Floats, length: float) -> Floats:
     return np.asarray(np.exp(-0.5 / length**2 * cdist(first, second, "sqeuclidean")))
 
 
@@ -98,7 +118,8 @@ class Linear:
     """A cloud's distances, linear in the unknowns about a state, of some of its points.
 
     Args:
-        points: (p, 3), metres.
+        points: (p, 3), metres, in the cloud's coordinates.
+        normals: of the surface at them, (p, 3), on the same axes.
         data: distances that the unknowns are to make zero, less what they make of them, (p,), metres.
         forces: derivative by the coefficients of the forces, (p, k), metres a newton.
         beside: the same by unknowns of unit variance, (p, m), metres.
@@ -107,6 +128,7 @@ class Linear:
     """
 
     points: Floats
+    normals: Floats
     data: Floats
     forces: Floats
     beside: Floats
@@ -116,7 +138,7 @@ class Linear:
     def some(self) -> Linear:
         """So few points that their covariance is at hand."""
         every = slice(None, None, -(-len(self.data) // _ASKED))
-        names = ("points", "data", "forces", "beside", "left_out", "weights")
+        names = ("points", "normals", "data", "forces", "beside", "left_out", "weights")
         return Linear(**{name: getattr(self, name)[every] for name in names})
 
 
@@ -133,7 +155,7 @@ def find_correlated(linear: Linear, noise: Scale, force: Scale, worth: float) ->
     """
     some = linear.some()
     by_forces, others = some.forces @ some.forces.T, some.beside @ some.beside.T + np.diag(some.left_out**2)
-    squares = cdist(some.points, some.points, "sqeuclidean")
+    squares, facing = cdist(some.points, some.points, "sqeuclidean"), some.normals @ some.normals.T
     extent = float(np.linalg.norm(np.ptp(some.points, axis=0)))
     beliefs = [noise, force, Scale(_SIZE, _SIZE_SPREAD), Scale(_LENGTH * extent, _LENGTH_SPREAD)]
 
@@ -141,12 +163,12 @@ def find_correlated(linear: Linear, noise: Scale, force: Scale, worth: float) ->
         scales = np.maximum(np.exp(logarithms), noise.least * np.eye(len(logarithms))[0])
         covariance = others + scales[1] ** 2 * by_forces
         if len(scales) > 2:
-            covariance += scales[2] ** 2 * np.exp(-0.5 / scales[3] ** 2 * squares)
+            covariance += scales[2] ** 2 * facing * np.exp(-0.5 / scales[3] ** 2 * squares)
         covariance[np.diag_indices(len(covariance))] += scales[0] ** 2 / some.weights
         try:
             factor = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
         except LinAlgError:
-            return np.inf
+            return _NEVER
         off = solve_triangular(factor, some.data, lower=True, check_finite=False)
         believed = sum(
             ((log - np.log(belief.median)) / belief.spread) ** 2
@@ -162,7 +184,7 @@ def find_correlated(linear: Linear, noise: Scale, force: Scale, worth: float) ->
         return float(least.fun), np.exp(least.x)
 
     median = [max(noise.median, noise.least), force.median]
-    without, _ = best(2, [median, [noise.least * 1.2, 10.0 * force.median]])
+    without, _ = best(2, [median, [max(_QUIET * noise.median, noise.least), _STRONG * force.median]])
     with_it, scales = best(4, [[*median, _SIZE, factor * beliefs[3].median] for factor in _STARTS])
     if without - with_it < worth:
         return None

@@ -125,14 +125,25 @@ class Problem:
         return slice(self.noise_part.stop, None)
 
     @cached_property
-    def _shared(self) -> Floats:
-        """What each coefficient of the correlated noise adds to the distances, (p, q), metres."""
-        return np.zeros((len(self.cloud), 0)) if self.correlated is None else self.correlated.patterns(self.cloud)
+    def _near(self) -> Floats:
+        """How much noise the points have in common with those that carry it, (p, q)."""
+        assert self.correlated is not None
+        return self.correlated.near(self.cloud)
+
+    def normals(self, trial: Trial) -> Floats:
+        """Of the surface at the points, (p, 3), on the cloud's axes."""
+        directions = trial.match.directions
+        return directions if trial.pose is None else directions @ trial.pose.rotation.T
 
     def shared_noise(self, trial: Trial) -> Floats:
         """The part of the distances that is taken for noise that neighbours share, (p,), metres."""
-        found: Floats = self._shared @ trial.coefficients[self.noise_part]
-        return found
+        if self.correlated is None:
+            return np.zeros(len(self.cloud))
+        return self.correlated.shifts(trial.coefficients[self.noise_part], self._near, self.normals(trial))
+
+    def _by_noise(self, trial: Trial) -> Floats | None:
+        """Derivative of the residuals by its coefficients, (p, q)."""
+        return None if self.correlated is None else -self.correlated.patterns(self._near, self.normals(trial))
 
     def carried(self, coefficients: Floats, before: Problem) -> Floats:
         """Coefficients of another problem for a start of this one, (k,); what it did not have is zero.
@@ -167,6 +178,7 @@ class Problem:
         others = np.setdiff1d(columns[self.force_part.stop :], columns[self.noise_part])
         return Linear(
             self.cloud[kept],
+            self.normals(trial)[kept],
             (jacobian @ coefficients - distances)[kept],
             jacobian[kept][:, self.force_part],
             jacobian[kept][:, others],
@@ -255,13 +267,13 @@ class Problem:
         """Derivative of the residuals by the coefficients, (p, k), exact."""
         rows = self.observed.rows(trial.match)
         by_pose = self._by_pose(trial, trial.match.directions, trial.cloud)
-        return self._by_coefficients(trial, rows, by_pose, -self._shared)
+        return self._by_coefficients(trial, rows, by_pose, self._by_noise(trial))
 
     def pulled(self, trial: Trial, cotangent: Floats) -> Floats:
         """Gradient by the coefficients, (k,), from the one by the residuals, (p,): J^T g with the adjoint."""
         rows = self.observed.rows(trial.match)
         by_pose = self._by_pose(trial, trial.match.directions, trial.cloud)
-        return self._pulled(trial, rows, by_pose, cotangent, -self._shared)
+        return self._pulled(trial, rows, by_pose, cotangent, self._by_noise(trial))
 
     def mark_residuals(self, trial: Trial) -> Floats:
         """Coordinates of the landmarks less where they were found, over their deviation, (3l,), body's axes."""

@@ -50,6 +50,7 @@ _MISSED, _EXPLAINED = 1.0, 0.5  # times the least noise, shared by neighbours; p
 _ALIKE = 0.2  # part of what a cloud has left that neighbours share: with less, nobody asks for correlated noise
 _A_TRY, _WORTH = -3.0, 5.0  # of the logarithm of the odds of correlated noise: for a try, and to be believed
 _TRIES, _SAME = 3, 0.15  # of finding its size and length; of their logarithms, less than which is no change
+_REACHED = 0.8  # part of a cloud that the noise of the frame before must reach
 _GONE = 1.0  # times the least noise: correlated noise that small is not looked for in the next frame
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
 _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
@@ -287,6 +288,9 @@ class Registration:
         return uncertainty(self.problem, self.trial, self.posterior, self.prepared.unseen)
 
 
+_Again = Callable[["Registrar", Registration], Registration]  # what a registrar makes of a cloud, from a result for it
+
+
 class Registrar:
     """Registers clouds to one body with one model; what does not depend on the cloud is prepared once.
 
@@ -435,11 +439,9 @@ class Registrar:
     def _afresh(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
         """From rest, and once more where neighbours are found to share noise; see `_cold`."""
         found = self._cold(points, begin, known)
-        return (
-            found
-            if found is known
-            else self._told_apart(found, lambda other, near: other._sought_anew(points, near, begin))
-        )
+        if found is known:
+            return found
+        return self._told_apart(found, lambda other, near: other._sought_anew(points, near, begin))
 
     def _followed(self, points: Cloud, start: Registration, begin: float) -> Registration:
         """From the frame before, or from rest with its forces."""
@@ -453,9 +455,7 @@ class Registrar:
         problem, found, doubt = self._doubted(problem, found, start.doubt, solver)
         return self._result(problem, found, start.prepared, begin, doubt)
 
-    def _told_apart(
-        self, found: Registration, again: Callable[[Registrar, Registration], Registration]
-    ) -> Registration:
+    def _told_apart(self, found: Registration, again: _Again) -> Registration:
         """The result; where its cloud has noise that neighbours share, what is found with that in mind.
 
         Forces have explained such noise as far as they can: only where it is left to itself it is seen as it is, so
@@ -469,7 +469,7 @@ class Registrar:
                 break
             if self._is_late:
                 return _out_of_time(best, told)
-            other = again(self.believing(CorrelatedNoise.over(found.problem.cloud, *told)), best)
+            other = again(self.believing(_noise_of(best, *told)), best)
             before, told = told, other.local.correlated(_WORTH)
             if told is not None:
                 best = other
@@ -646,7 +646,7 @@ class Registrar:
         start[problem.force_part] = prepared.forces.nearest(near.unknown_forces)
         start[problem.pose_part] = near.coefficients[before.pose_part]
         start[problem.condition_part] = near.coefficients[before.condition_part]
-        found = self.options.solver.solve(problem, start, replace(near.trial, coefficients=start))
+        found = self.options.solver.solve(problem, start, near.trial)
         return self._finished(points, prepared, found, begin)
 
     def _from_rest(self, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> Found:
@@ -924,11 +924,16 @@ def _is_shared(found: Registration, least: float) -> bool:
     return part > _ALIKE and found.rms_distance * np.sqrt(part) > least
 
 
+def _noise_of(found: Registration, size: float, length: float) -> CorrelatedNoise:
+    """Noise of a size and a length, metres, for the cloud of a result."""
+    return CorrelatedNoise.over(found.problem.cloud, found.problem.normals(found.trial), size, length)
+
+
 def _still_there(correlated: CorrelatedNoise | None, points: Cloud) -> CorrelatedNoise | None:
-    """The noise that neighbours shared in the frame before, for this one's points; None where there was hardly any."""
-    if correlated is None or correlated.size < _GONE * NOISE.least:
+    """The noise that neighbours shared in the frame before; None for hardly any, or for a cloud that lies elsewhere."""
+    if correlated is None or correlated.size < _GONE * NOISE.least or correlated.reaches(points.points) < _REACHED:
         return None
-    return correlated.of(points.points)
+    return correlated
 
 
 def _after(first: Found, second: Found) -> Found:

@@ -173,7 +173,7 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
         verdict = Verdict.REFUSED if systematic > 2.0 * expected.systematic else Verdict.DOUBTFUL
         findings.append(
             (verdict, f"organ and cloud do not match: whole patches of the surface are {1e3 * systematic:.1f} mm off, "
-                      f"which no noise of single points explains (up to {1e3 * expected.systematic:.1f} mm is let pass)")
+                      f"which no noise of points explains (up to {1e3 * expected.systematic:.1f} mm is let pass)")
         )  # fmt: skip
     outliers = float(np.mean(found.weights < 0.05))
     if outliers > expected.outliers:
