@@ -161,12 +161,12 @@ class ContactRegistrar:
         if not draft.judgement.is_usable:
             return replace(draft, seconds=time.perf_counter() - begin)
         found = self._registrar(draft).register(cloud)
-        least = max(draft.noise, self.anywhere.noise.least)
+        least = max(draft.scatter, self.anywhere.noise.least)
         judgement = found.judgement
-        if found.noise > _WORSE * least:
+        if found.scatter > _WORSE * least:
             reason = (
-                f"one contact does not explain the cloud: points lie {1e3 * found.noise:.2f} mm from the surface, with "
-                f"forces anywhere {1e3 * draft.noise:.2f} mm"
+                f"one contact does not explain the cloud: points lie {1e3 * found.scatter:.2f} mm from the surface, "
+                f"with forces anywhere {1e3 * draft.scatter:.2f} mm"
             )
             verdict = Verdict.REFUSED if judgement.verdict is Verdict.REFUSED else Verdict.DOUBTFUL
             judgement = Judgement(verdict, (*judgement.reasons, reason))

@@ -23,13 +23,14 @@ from .evidence import Scale
 Floats = NDArray[np.float64]
 _ASKED = 300  # points that the evidence is taken from
 _CHOSEN = 1000  # points among which centres are chosen
-_MOST = 120  # centres
+_MOST = 400  # centres
 _ROUND_OFF = 1e-9
 _NEAR = 0.5  # of the correlation
 _LEFT = 0.01  # of the variance at any point is not carried by the centres
 _SIZE, _SIZE_SPREAD = 5e-4, 1.0  # metres, and of its logarithm: what is believed of such noise where there is some
 _LENGTH, _LENGTH_SPREAD = 0.15, 0.5  # of the cloud's extent, and of its logarithm
 _STARTS = 0.5, 1.0, 2.0  # times the length that is believed
+_LARGEST, _LONGEST = 5e-3, 0.4  # metres, of the extent: beyond, it is no noise but another place or shape
 _QUIET, _STRONG = 0.2, 10.0  # of the noise and the forces that are expected: where forces explain the noise
 _EVALUATIONS = 160
 _NEVER = 1e12  # minus the logarithm of the chance of scales with no covariance
@@ -161,6 +162,8 @@ def find_correlated(linear: Linear, noise: Scale, force: Scale, worth: float) ->
 
     def unlikely(logarithms: Floats) -> float:
         scales = np.maximum(np.exp(logarithms), noise.least * np.eye(len(logarithms))[0])
+        if len(scales) > 2 and (scales[2] > _LARGEST or scales[3] > _LONGEST * extent):
+            return _NEVER
         covariance = others + scales[1] ** 2 * by_forces
         if len(scales) > 2:
             covariance += scales[2] ** 2 * facing * np.exp(-0.5 / scales[3] ** 2 * squares)

@@ -50,6 +50,7 @@ _MISSED, _EXPLAINED = 1.0, 0.5  # times the least noise, shared by neighbours; p
 _ALIKE = 0.2  # part of what a cloud has left that neighbours share: with less, nobody asks for correlated noise
 _A_TRY, _WORTH = -3.0, 5.0  # of the logarithm of the odds of correlated noise: for a try, and to be believed
 _TRIES, _SAME = 3, 0.15  # of finding its size and length; of their logarithms, less than which is no change
+_SHARING = 1000  # points: of more, that share noise, nothing more is learned
 _REACHED = 0.8  # part of a cloud that the noise of the frame before must reach
 _GONE = 1.0  # times the least noise: correlated noise that small is not looked for in the next frame
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
@@ -235,6 +236,11 @@ class Registration:
     def coefficients(self) -> Floats:
         """Of forces, pose, conditions and model error, (k,)."""
         return self.trial.coefficients
+
+    @cached_property
+    def scatter(self) -> float:
+        """Standard deviation of a point's distance with what neighbours share of its noise, metres."""
+        return float(np.sqrt(self.noise**2 + np.mean(self.problem.shared_noise(self.trial) ** 2)))
 
     @property
     def unknown_forces(self) -> Floats:
@@ -445,6 +451,7 @@ class Registrar:
 
     def _followed(self, points: Cloud, start: Registration, begin: float) -> Registration:
         """From the frame before, or from rest with its forces."""
+        points = self._enough(points)
         problem = self._problem(points, start.prepared, start.trial, start.doubt)
         near = problem.begun(problem.carried(start.trial.coefficients, start.problem), start.trial)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
@@ -469,7 +476,10 @@ class Registrar:
                 break
             if self._is_late:
                 return _out_of_time(best, told)
-            other = again(self.believing(_noise_of(best, *told)), best)
+            try:
+                other = again(self.believing(_noise_of(best, *told)), best)
+            except NotConverged:
+                break
             before, told = told, other.local.correlated(_WORTH)
             if told is not None:
                 best = other
@@ -513,7 +523,7 @@ class Registrar:
     def _refined(
         self, points: Cloud, draft: Registration, fast: ForwardModel, last: Registration | None, begin: float
     ) -> Registration:
-        solver = self.options.solver.following()
+        points, solver = self._enough(points), self.options.solver.following()
         if last is not None and last.draft is not None and last.draft.prepared is draft.prepared:
             return self._carried_on(points, fast, last, begin)
         # Told a zone, the exact model gathers no forces within it, and takes none that were: see `options_for`.
@@ -640,7 +650,7 @@ class Registrar:
 
         They are not gathered: where noise looks like them, what was found of their place is no belief to build upon.
         """
-        prepared, before = self._everywhere, near.problem
+        points, prepared, before = self._enough(points), self._everywhere, near.problem
         problem = self._plain(points, prepared)
         start = np.zeros(problem.size)
         start[problem.force_part] = prepared.forces.nearest(near.unknown_forces)
@@ -730,6 +740,10 @@ class Registrar:
         every = self._prepared(windowed(self.forces, where))
         return every.informed(self.observed, self.options.gathering.informed)
 
+    def _enough(self, points: Cloud) -> Cloud:
+        """Of points that share noise no more than show it: what its pattern leaves out would be believed of each."""
+        return points if self.correlated is None else points.thinned(_SHARING)
+
     def _is_nearer_at_rest(self, near: Trial, start: Registration) -> bool:
         """True where a cloud lies nearer to the body at rest than to what the last frame has found."""
         far = robust_deviation(near.match.distances)
@@ -741,7 +755,7 @@ class Registrar:
 
     def _has_left(self, result: Registration, start: Registration) -> bool:
         """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
-        return result.noise > _LEFT * max(start.noise, self.noise.least)
+        return result.scatter > _LEFT * max(start.scatter, self.noise.least)
 
     def _checked(self, cloud: ArrayLike) -> Cloud:
         given = Cloud.of(cloud)
@@ -894,7 +908,7 @@ def expected_force(body: Body, young_modulus: float) -> float:
 
 def badness(result: Registration) -> tuple[int, float]:
     """By which results for one cloud are ordered, the best first."""
-    return list(Verdict).index(result.judgement.verdict), result.noise
+    return list(Verdict).index(result.judgement.verdict), result.scatter
 
 
 def _out_of_time(found: Registration, told: tuple[float, float]) -> Registration:
