@@ -176,6 +176,9 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "evaluations": result.evaluations,
         "solve_seconds": result.seconds,
     }
+    shared = result.problem.correlated
+    if shared is not None:
+        row["shared_noise"] = {"size_m": shared.size, "length_m": shared.length}
     if result.estimates:
         row["estimates"] = [asdict(estimate) for estimate in result.estimates]
     if doubt.any():  # there are unknown forces
@@ -255,6 +258,9 @@ def describe(row: Mapping[str, Any]) -> str:
         return line
     force, doubt = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
     line += f", cloud to surface {millimetres(row['rms_distance_m'])}"
+    if "shared_noise" in row:
+        size, length = (row["shared_noise"][name] for name in ("size_m", "length_m"))
+        line += f", of which neighbours within {millimetres(length, 0)} share noise of {millimetres(size)}"
     line += f", {row['landmarks']} landmarks" if "landmarks" in row else ""
     line += (
         f", net force {force:.3f} ± {doubt:.3f} N" if force > 0.0 or doubt > 0.0 else ""

@@ -17,6 +17,7 @@ from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.linalg.lapack import dpstrf
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
+from threadpoolctl import threadpool_limits
 
 from .evidence import Scale
 
@@ -187,8 +188,9 @@ def find_correlated(linear: Linear, noise: Scale, force: Scale, worth: float) ->
         return float(least.fun), np.exp(least.x)
 
     median = [max(noise.median, noise.least), force.median]
-    without, _ = best(2, [median, [max(_QUIET * noise.median, noise.least), _STRONG * force.median]])
-    with_it, scales = best(4, [[*median, _SIZE, factor * beliefs[3].median] for factor in _STARTS])
+    with threadpool_limits(1, "blas"):  # for matrices of this size several threads only wait for each other
+        without, _ = best(2, [median, [max(_QUIET * noise.median, noise.least), _STRONG * force.median]])
+        with_it, scales = best(4, [[*median, _SIZE, factor * beliefs[3].median] for factor in _STARTS])
     if without - with_it < worth:
         return None
     return float(scales[2]), float(scales[3])

@@ -1,0 +1,224 @@
+"""Noise that neighbouring points share: told from noise of their own and from forces, and an unknown beside them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from softtwin.meshes.body import Body
+from softtwin.registration.correlated import CorrelatedNoise, Linear, find_correlated
+from softtwin.registration.evidence import Scale
+from softtwin.registration.hybrid import HybridRegistrar
+from softtwin.registration.lbfgs import LBFGS
+from softtwin.registration.pose import Pose
+from softtwin.registration.registrar import Gathering, Registrar, RegistrationOptions
+from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.unknowns import PosePrior, nodal_forces
+from softtwin.registration.verdict import Verdict
+
+from .conftest import Cantilever, CantileverState, cloud_on, tip_forces
+
+OWN, SIZE, LENGTH = 2e-4, 2e-3, 0.06
+NET = (0.0, 0.3, -0.8)
+
+
+def field(points: np.ndarray, length: float, rng: np.random.Generator) -> np.ndarray:
+    """A smooth field of shifts, (p, 3), of unit variance: random Fourier features of a Gaussian correlation."""
+    waves, phases = rng.standard_normal((300, 3)) / length, rng.uniform(0.0, 2.0 * np.pi, 300)
+    return np.sqrt(2.0 / 300.0) * np.cos(points @ waves.T + phases) @ rng.standard_normal((300, 3))
+
+
+def shaken(cloud: np.ndarray, rng: np.random.Generator, size: float = SIZE) -> np.ndarray:
+    return cloud + size * field(cloud, LENGTH, rng) + OWN * rng.standard_normal(cloud.shape)
+
+
+def registrar(body: Body, pose: PosePrior | None = None, model: Cantilever | None = None) -> Registrar:
+    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 0.5, least=1e-4))
+    options = RegistrationOptions(gathering=Gathering(rounds=0))
+    return Registrar(
+        model or Cantilever(body), SurfaceDistance(body, body.surfaces["observed"]), forces, options, pose=pose
+    )
+
+
+def truth(body: Body, part: float = 1.0) -> np.ndarray:
+    return Cantilever(body).solve(part * tip_forces(body, NET)).displacement
+
+
+def sphere(count: int, rng: np.random.Generator) -> np.ndarray:
+    points = rng.standard_normal((count, 3))
+    return 0.1 * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def linear(data: np.ndarray, points: np.ndarray) -> Linear:
+    """Two directions of force that nothing acts along."""
+    slopes = np.column_stack([points[:, 0], np.ones(len(points))])
+    none = np.zeros((len(points), 0))
+    return Linear(points, points / 0.1, data, slopes, none, np.zeros(len(points)), np.ones(len(points)))
+
+
+def test_its_size_and_length_are_told(rng: np.random.Generator) -> None:
+    noise, force, told = Scale(5e-4, 1.5, least=1e-4), Scale(1e-3, 1.0), []
+    for _ in range(12):
+        points = sphere(600, rng)
+        along = np.einsum("pi,pi->p", 1e-3 * field(points, 0.03, rng), points / 0.1)
+        found = find_correlated(linear(along + OWN * rng.standard_normal(600), points), noise, force, 5.0)
+        assert found is not None
+        told.append(found)
+    np.testing.assert_allclose(np.mean(told, axis=0), [1e-3, 0.03], rtol=0.1)
+
+
+@pytest.mark.parametrize("scale", [2e-4, 1e-3])
+def test_noise_of_single_points_is_not_taken_for_it(rng: np.random.Generator, scale: float) -> None:
+    noise, force = Scale(5e-4, 1.5, least=1e-4), Scale(1e-3, 1.0)
+    for _ in range(12):
+        points = sphere(600, rng)
+        assert find_correlated(linear(scale * rng.standard_normal(600), points), noise, force, 0.0) is None
+
+
+def test_its_patterns_carry_its_covariance(rng: np.random.Generator) -> None:
+    """Shifts of covariance a^2 exp(-d^2 / 2 l^2), along the normals: n . n' between points."""
+    points = sphere(500, rng)
+    normals = points / 0.1
+    noise = CorrelatedNoise.over(points, normals, 2e-3, 0.04)
+    patterns = noise.patterns(noise.near(points), normals)
+    apart = ((points[:, None] - points) ** 2).sum(axis=2)
+    wanted = 4e-6 * np.exp(-apart / (2.0 * 0.04**2)) * (normals @ normals.T)
+    assert noise.count < 150
+    np.testing.assert_allclose(patterns @ patterns.T, wanted, atol=0.01 * 4e-6)
+    coefficients = rng.standard_normal(noise.count)
+    shifts = noise.shifts(coefficients, noise.near(points), normals)
+    np.testing.assert_allclose(shifts, patterns @ coefficients, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        noise.resized(0.5).patterns(noise.near(points), normals), 0.5 * patterns, rtol=1e-9, atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("has_pose", [False, True])
+def test_residuals_have_the_derivative_that_they_say(body: Body, rng: np.random.Generator, has_pose: bool) -> None:
+    prior = PosePrior(Pose.identity(), body.points.mean(axis=0)) if has_pose else None
+    found = registrar(body, prior).register(shaken(cloud_on(body, truth(body), 300, rng), rng))
+    problem, at = found.problem, found.trial
+    assert problem.correlated is not None
+    some = rng.standard_normal(problem.size) * np.where(np.arange(problem.size) < problem.forces.size, 0.01, 0.1)
+    cotangent = rng.standard_normal(len(problem.cloud))
+    step = 1e-4 * some
+    ahead, behind = (problem.residuals(problem.trial(at.coefficients + sign * step, at), OWN) for sign in (1.0, -1.0))
+    slope, scale = (ahead - behind) / 2e-4, np.abs(ahead - behind).max() / 2e-4
+    # The normals turn with the surface, which the derivative of the shifts along them leaves out: second order.
+    assert np.median(np.abs(problem.jacobian(at) @ some - slope)) < 2e-2 * scale
+    part = problem.noise_part
+    only = np.zeros(problem.size)
+    only[part] = some[part]
+    moved = problem.residuals(problem.trial(at.coefficients + only, at), OWN) - problem.residuals(at, OWN)
+    np.testing.assert_allclose(problem.jacobian(at) @ only, moved, atol=1e-9)
+    pulled = problem.pulled(at, cotangent)
+    np.testing.assert_allclose(pulled, problem.jacobian(at).T @ cotangent, rtol=1e-8, atol=1e-9 * np.abs(pulled).max())
+
+
+def test_forces_are_as_far_off_as_they_say(body: Body, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Net forces across the beam, against those that only reckon with fewer points: nearer, and not too sure."""
+    made, scores, off = registrar(body), [], {"seen": [], "unseen": []}
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        found = made.register(shaken(cloud_on(body, truth(body), 400, rng), rng))
+        noise = found.problem.correlated
+        assert found.judgement.is_usable and noise is not None
+        assert noise.length == pytest.approx(LENGTH, rel=0.35) and noise.size == pytest.approx(SIZE, rel=0.35)
+        assert found.scatter > 0.5 * SIZE > 2.0 * found.noise
+        off["seen"].append((found.net_force - NET)[1:])
+        covariance = found.net_force_covariance[1:, 1:]
+        scores.append(off["seen"][-1] @ np.linalg.solve(covariance, off["seen"][-1]) / 2.0)
+        with monkeypatch.context() as unseen:
+            unseen.setattr("softtwin.registration.gauss_newton.find_correlated", lambda *_: None)
+            rng = np.random.default_rng(seed)
+            again = made.register(shaken(cloud_on(body, truth(body), 400, rng), rng))
+        off["unseen"].append((again.net_force - NET)[1:])
+    assert 0.3 < np.median(scores) < 1.6  # of two components: 0.69
+    assert np.std(off["seen"]) < 0.85 * np.std(off["unseen"])
+
+
+def test_a_clean_cloud_knows_of_none(body: Body, rng: np.random.Generator) -> None:
+    for noise in (0.0, 1e-4, 1e-3):
+        found = registrar(body).register(cloud_on(body, truth(body), 400, rng, noise))
+        assert found.problem.correlated is None and found.scatter == found.noise
+
+
+def test_frames_that_follow_keep_it_until_it_is_gone(body: Body, rng: np.random.Generator) -> None:
+    made, last, kept = registrar(body), None, []
+    for frame in range(5):
+        cloud = cloud_on(body, truth(body, 1.0 + 0.02 * frame), 400, rng)
+        last = made.follow(shaken(cloud, rng), last)
+        kept.append(last.problem.correlated)
+        assert last.judgement.is_usable
+    assert all(noise is not None for noise in kept)
+    assert kept[1].centres is kept[4].centres  # found once
+    for _ in range(8):
+        last = made.follow(cloud_on(body, truth(body, 1.1), 400, rng, OWN), last)
+    assert last.problem.correlated is None
+    assert np.linalg.norm(last.displacement - truth(body, 1.1), axis=1).mean() < 2e-4
+
+
+def test_another_view_is_looked_at_anew(body: Body, rng: np.random.Generator) -> None:
+    """What carries the noise is where the cloud was: a cloud of the other end has its own."""
+    made, cloud = registrar(body), cloud_on(body, truth(body), 1500, rng)
+    near, far = (shaken(part, rng) for part in (cloud[cloud[:, 0] < 0.4], cloud[cloud[:, 0] > 0.4]))
+    first = made.register(near)
+    second = made.follow(far, first)
+    for found, points in ((first, near), (second, far)):
+        assert found.problem.correlated is not None
+        assert found.problem.correlated.reaches(points) > 0.95
+    assert second.problem.correlated.reaches(near) < 0.5
+
+
+def test_l_bfgs_finds_it_too(body: Body, rng: np.random.Generator) -> None:
+    """Of so many more unknowns it often ends at its limit of iterations, doubtful and hardly farther off."""
+    cloud, made = shaken(cloud_on(body, truth(body), 300, rng), rng), registrar(body)
+    first = made.register(cloud)
+    other = Registrar(made.model, made.observed, made.forces, replace(made.options, solver=LBFGS())).register(cloud)
+    assert other.problem.correlated is not None
+    apart = np.linalg.norm(first.displacement - other.displacement, axis=1).mean()
+    assert apart < other.uncertainty.deviation.mean()
+
+
+def test_the_exact_model_goes_on_with_what_the_fast_one_has_told(body: Body, rng: np.random.Generator) -> None:
+    fast, exact = registrar(body), registrar(body)
+    both, last = HybridRegistrar(fast, exact), None
+    for _ in range(3):
+        last = both.follow(shaken(cloud_on(body, truth(body), 400, rng), rng), last)
+        assert last.draft is not None and last.problem.correlated is not None
+        assert last.problem.correlated.centres is last.draft.problem.correlated.centres
+    assert np.linalg.norm(last.displacement - truth(body), axis=1).mean() < 3.0 * last.uncertainty.deviation.mean()
+
+
+class Ticking(Cantilever):
+    """A model of which each state takes a second of a clock that nothing else moves."""
+
+    now = 0.0
+
+    def solve(self, forces: ArrayLike, near: Any = None) -> CantileverState:
+        self.now += 1.0
+        return super().solve(forces, near)
+
+
+def test_without_time_to_tell_it_from_forces_a_frame_is_doubtful(
+    body: Body, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = Ticking(body)
+    monkeypatch.setattr(time, "monotonic", lambda: model.now)
+    made, cloud = registrar(body, model=model), shaken(cloud_on(body, truth(body), 400, rng), rng)
+    model.now = 0.0
+    whole, needed = made.register(cloud), model.now
+    assert whole.problem.correlated is not None
+    said = "no time was left to tell that from forces"
+    judged = []
+    for budget in np.arange(1.0, needed):
+        model.now = 0.0
+        judgement = made.limited(float(budget)).register(cloud).judgement
+        judged.append(any(said in reason for reason in judgement.reasons))
+        assert judgement.verdict is not Verdict.ACCEPTED or not judged[-1]
+    assert any(judged)
