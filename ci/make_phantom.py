@@ -9,6 +9,7 @@ equals, which the page's simulated camera looks at.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -184,4 +185,6 @@ def main(check: bool, kept: str = "") -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main("--check" in sys.argv, os.environ.get("PHANTOM_WORK", "")))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing that is there")
+    sys.exit(main(parser.parse_args().check, os.environ.get("PHANTOM_WORK", "")))
