@@ -49,6 +49,7 @@ _DOUBTS, _SURE = 3, 0.1  # times that the model's error is scaled anew; not wher
 _MISSED, _EXPLAINED = 1.0, 0.5  # times the least noise, shared by neighbours; part of it that forces anywhere leave
 _ALIKE = 0.2  # part of what a cloud has left that neighbours share: with less, nobody asks for correlated noise
 _A_TRY, _WORTH = -3.0, 5.0  # of the logarithm of the odds of correlated noise: for a try, and to be believed
+_EDGES = 1.75  # of the surface: a shorter length is none of noise that forces follow
 _TRIES, _SAME = 3, 0.15  # of finding its size and length; of their logarithms, less than which is no change
 _SHARING = 1000  # points: of more, that share noise, nothing more is learned
 _REACHED = 0.8  # part of a cloud that the noise of the frame before must reach
@@ -466,13 +467,14 @@ class Registrar:
         """The result; where its cloud has noise that neighbours share, what is found with that in mind.
 
         Forces have explained such noise as far as they can: only where it is left to itself it is seen as it is, so
-        that a guess is good enough for a second try, and that one decides.
+        that a guess is good enough for a second try, and that one decides. What is shared over less than the edges of
+        the surface is the mesh's own, or noise that no force can follow: for that points are counted (`alike`).
         """
         if found.problem.correlated is not None or not _is_shared(found, self.noise.least):
             return found
         told, best = found.local.correlated(_A_TRY), found
         for _ in range(_TRIES):
-            if told is None:
+            if told is None or told[1] < _EDGES * self.observed.edge:
                 break
             if self._is_late:
                 return _out_of_time(best, told)
@@ -481,7 +483,7 @@ class Registrar:
             except NotConverged:
                 break
             before, told = told, other.local.correlated(_WORTH)
-            if told is not None:
+            if told is not None and told[1] >= _EDGES * self.observed.edge:
                 best = other
                 if np.abs(np.log(np.divide(told, before))).max() < _SAME:
                     break

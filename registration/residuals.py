@@ -223,6 +223,12 @@ class SurfaceDistance:
         return mean
 
     @cached_property
+    def edge(self) -> float:
+        """Mean length of the edges of the observed side at rest, metres."""
+        corners = self.rest[self.triangles]
+        return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
+
+    @cached_property
     def _curvature(self) -> Floats:
         return mean_curvature(Surface(self.rest, self.triangles))
 
