@@ -160,7 +160,7 @@ class ContactRegistrar:
         draft = replace(draft, draft=draft)
         if not draft.judgement.is_usable:
             return replace(draft, seconds=time.perf_counter() - begin)
-        found = self._registrar(draft).register(cloud)
+        found = self._registrar(draft).believing(draft.problem.correlated).register(cloud)
         least = max(draft.scatter, self.anywhere.noise.least)
         judgement = found.judgement
         if found.scatter > _WORSE * least:
@@ -179,7 +179,9 @@ class ContactRegistrar:
         middle = sizes**2 @ body.points[nodes] / max(float(sizes @ sizes), 1e-300)
         size = self.patch.force or max(float(np.linalg.norm(draft.net_force)), 1e-12)
         contact = Contact(nodes, middle, _REACH * body.size, self.patch.radius, size)
-        options = replace(anywhere.options, gathering=replace(anywhere.options.gathering, rounds=0))
+        # What neighbours are missed by alike is for forces anywhere to tell: here it would hide a second contact.
+        gathering = replace(anywhere.options.gathering, rounds=0)
+        options = replace(anywhere.options, gathering=gathering, correlated=False)
         return Registrar(
             anywhere.model,
             anywhere.observed,

@@ -113,6 +113,7 @@ class RegistrationOptions:
         belief: when the size of the forces is left to the cloud.
         distance: of points to the surface, or to the planes of its triangles; see `SurfaceDistance`.
         normal_deviation: standard deviation of a measured normal across itself, radians.
+        correlated: look for noise that neighbouring points share; see `correlated.find_correlated`.
     """
 
     noise: Scale = NOISE
@@ -122,6 +123,7 @@ class RegistrationOptions:
     belief: Belief = field(default_factory=Belief)
     distance: Distance = "surface"
     normal_deviation: float = NORMAL_DEVIATION
+    correlated: bool = True
 
     def __post_init__(self) -> None:
         if self.distance not in ("surface", "plane"):
@@ -470,7 +472,9 @@ class Registrar:
         that a guess is good enough for a second try, and that one decides. What is shared over less than the edges of
         the surface is the mesh's own, or noise that no force can follow: for that points are counted (`alike`).
         """
-        if found.problem.correlated is not None or not _is_shared(found, self.noise.least):
+        if not self.options.correlated or found.problem.correlated is not None:
+            return found
+        if not _is_shared(found, self.noise.least):
             return found
         told, best = found.local.correlated(_A_TRY), found
         for _ in range(_TRIES):
