@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from .evidence import Scale
 
 Floats = NDArray[np.float64]
-_ASKED = 300  # points that the evidence is taken from
+_ASKED, _FEWEST = 300, 30  # points that the evidence is taken from, and of which it is
 _CHOSEN = 1000  # points among which centres are chosen
 _MOST = 400  # centres
 _ROUND_OFF = 1e-9
@@ -156,13 +156,18 @@ def find_correlated(linear: Linear, noise: Scale, force: Scale, worth: float) ->
         worth: least logarithm of the odds for it.
     """
     some = linear.some()
+    extent = float(np.linalg.norm(np.ptp(some.points, axis=0))) if len(some.points) else 0.0
+    if len(some.points) < _FEWEST or extent == 0.0:
+        return None
     by_forces, others = some.forces @ some.forces.T, some.beside @ some.beside.T + np.diag(some.left_out**2)
     squares, facing = cdist(some.points, some.points, "sqeuclidean"), some.normals @ some.normals.T
-    extent = float(np.linalg.norm(np.ptp(some.points, axis=0)))
     beliefs = [noise, force, Scale(_SIZE, _SIZE_SPREAD), Scale(_LENGTH * extent, _LENGTH_SPREAD)]
+    known = np.array([belief.spread == 0.0 for belief in beliefs])
+    medians = np.array([belief.median for belief in beliefs])
 
     def unlikely(logarithms: Floats) -> float:
-        scales = np.maximum(np.exp(logarithms), noise.least * np.eye(len(logarithms))[0])
+        scales = np.where(known[: len(logarithms)], medians[: len(logarithms)], np.exp(logarithms))
+        scales[0] = max(scales[0], noise.least)
         if len(scales) > 2 and (scales[2] > _LARGEST or scales[3] > _LONGEST * extent):
             return _NEVER
         covariance = others + scales[1] ** 2 * by_forces

@@ -50,6 +50,7 @@ _MISSED, _EXPLAINED = 1.0, 0.5  # times the least noise, shared by neighbours; p
 _ALIKE = 0.2  # part of what a cloud has left that neighbours share: with less, nobody asks for correlated noise
 _A_TRY, _WORTH = -3.0, 5.0  # of the logarithm of the odds of correlated noise: for a try, and to be believed
 _EDGES = 1.75  # of the surface: a shorter length is none of noise that forces follow
+_AGAIN = 50  # frames on, what was not found is looked for again
 _TRIES, _SAME = 3, 0.15  # of finding its size and length; of their logarithms, less than which is no change
 _SHARING = 1000  # points: of more, that share noise, nothing more is learned
 _REACHED = 0.8  # part of a cloud that the noise of the frame before must reach
@@ -204,7 +205,7 @@ class Registration:
         problem: what was solved, for the cloud and the model's error as they were taken in the end.
         posterior: of the coefficients.
         local: the objective's model there.
-        was_looked_for: whether noise that neighbours share was looked for, here or before, and not found.
+        looked_for: so many frames on noise that neighbours share was looked for and not found; 0 where it was not.
         draft: what a faster model had found, where this one went on from there.
     """
 
@@ -232,7 +233,7 @@ class Registration:
     problem: Problem
     posterior: Posterior
     local: LocalModel
-    was_looked_for: bool = False
+    looked_for: int = 0
     draft: Registration | None = None
 
     @property
@@ -441,8 +442,8 @@ class Registrar:
             now = time.monotonic()
             hurried = self.limited(now + _SEARCHING * (self.options.solver.until - now))
             return hurried._afresh(points, begin, result)
-        if start.was_looked_for:
-            return replace(result, was_looked_for=True)
+        if 0 < start.looked_for < _AGAIN:
+            return replace(result, looked_for=start.looked_for + 1)
         return like._told_apart(result, lambda other, near: other._sought_anew(points, near, begin))
 
     def _afresh(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
@@ -491,7 +492,7 @@ class Registrar:
                 best = other
                 if np.abs(np.log(np.divide(told, before))).max() < _SAME:
                     break
-        return replace(best, was_looked_for=best is found)
+        return replace(best, looked_for=int(best is found))
 
     @property
     def _is_late(self) -> bool:
@@ -522,7 +523,10 @@ class Registrar:
             noise = _still_there(last.problem.correlated, points)
         like = self.believing(noise)
         found = like._refined(points, draft, fast, last, begin)
-        if not draft.was_looked_for:
+        before = 0 if last is None else last.looked_for
+        if 0 < max(draft.looked_for, before) < _AGAIN:
+            found = replace(found, looked_for=max(draft.looked_for, before + 1))
+        else:
             found = like._told_apart(found, lambda other, _: other._refined(points, draft, fast, None, begin))
         return replace(found, draft=draft)
 

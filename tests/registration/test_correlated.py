@@ -86,6 +86,26 @@ def test_noise_of_single_points_is_not_taken_for_it(rng: np.random.Generator, sc
         assert find_correlated(linear(scale * rng.standard_normal(600), points), noise, force, 0.0) is None
 
 
+def test_a_spot_and_a_handful_of_points_tell_nothing(rng: np.random.Generator) -> None:
+    noise, force = Scale(5e-4, 1.5, least=1e-4), Scale(1e-3, 1.0)
+    few = sphere(20, rng)
+    assert find_correlated(linear(few[:, 0], few), noise, force, -99.0) is None
+    spot = np.tile(few[:1], (50, 1))
+    assert find_correlated(linear(np.ones(50), spot), noise, force, -99.0) is None
+
+
+def test_a_noise_that_is_known_is_believed(rng: np.random.Generator) -> None:
+    """Told 0.2 mm, the rest is shared."""
+    points = sphere(600, rng)
+    along = np.einsum("pi,pi->p", 1e-3 * field(points, 0.03, rng), points / 0.1) + OWN * rng.standard_normal(600)
+    found = find_correlated(linear(along, points), Scale(OWN, 0.0), Scale(1e-3, 1.0), 5.0)
+    assert found is not None
+    assert found[0] == pytest.approx(1e-3, rel=0.25)
+    assert (
+        find_correlated(linear(OWN * rng.standard_normal(600), points), Scale(OWN, 0.0), Scale(1e-3, 1.0), 0.0) is None
+    )
+
+
 def test_its_patterns_carry_its_covariance(rng: np.random.Generator) -> None:
     """Shifts of covariance a^2 exp(-d^2 / 2 l^2), along the normals: n . n' between points."""
     points = sphere(500, rng)
@@ -154,7 +174,9 @@ def test_what_is_shared_over_less_than_the_edges_only_counts_points(rng: np.rand
     coarse = seen_from_above()
     cloud = cloud_on(coarse, truth(coarse), 400, rng)
     found = registrar(coarse).register(shaken(cloud, rng))
-    assert found.problem.correlated is None and found.was_looked_for
+    assert found.problem.correlated is None and found.looked_for == 1
+    again = registrar(coarse).follow(shaken(cloud, rng), found)
+    assert again.looked_for == 2  # a frame on
     assert found.alike > 2.0
 
 
