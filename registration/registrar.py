@@ -204,7 +204,7 @@ class Registration:
         trace: one entry an iteration.
         problem: what was solved, for the cloud and the model's error as they were taken in the end.
         posterior: of the coefficients.
-        local: the objective's model there.
+        local: the objective's model there; None for a result that was put together otherwise.
         looked_for: so many frames on noise that neighbours share was looked for and not found; 0 where it was not.
         draft: what a faster model had found, where this one went on from there.
     """
@@ -232,7 +232,7 @@ class Registration:
     trace: tuple[Step, ...]
     problem: Problem
     posterior: Posterior
-    local: LocalModel
+    local: LocalModel | None = None
     looked_for: int = 0
     draft: Registration | None = None
 
@@ -473,9 +473,10 @@ class Registrar:
         that a guess is good enough for a second try, and that one decides. What is shared over less than the edges of
         the surface is the mesh's own, or noise that no force can follow: for that points are counted (`alike`).
         """
-        if not self.options.correlated or found.problem.correlated is not None:
+        if not self.options.correlated or found.problem.correlated is not None or found.local is None:
             return found
-        if not _is_shared(found, self.noise.least):
+        is_worth_it = found.outcome is not Outcome.REFUSED and found.noise < _HOPELESS * self.expectations.noise
+        if not is_worth_it or not _is_shared(found, self.noise.least):
             return found
         told, best = found.local.correlated(_A_TRY), found
         for _ in range(_TRIES):
@@ -487,7 +488,7 @@ class Registrar:
                 other = again(self.believing(_noise_of(best, *told)), best)
             except NotConverged:
                 break
-            before, told = told, other.local.correlated(_WORTH)
+            before, told = told, None if other.local is None else other.local.correlated(_WORTH)
             if told is not None and told[1] >= _EDGES * self.observed.edge:
                 best = other
                 if np.abs(np.log(np.divide(told, before))).max() < _SAME:

@@ -192,7 +192,7 @@ def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[s
                 evaluations=5,
                 seconds=0.1,
                 trace=(),
-                problem=None,  # type: ignore[arg-type]
+                problem=SimpleNamespace(correlated=None),  # type: ignore[arg-type]
                 posterior=None,  # type: ignore[arg-type]
             )
             vars(result).update(
