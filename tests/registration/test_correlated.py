@@ -164,7 +164,7 @@ def test_forces_are_as_far_off_as_they_say(body: Body) -> None:
         scores.append(missed @ np.linalg.solve(found.net_force_covariance[1:, 1:], missed) / 2.0)
     assert len(told) > 12
     np.testing.assert_allclose(np.median(told, axis=0), [SIZE, LENGTH], rtol=0.3)
-    assert 0.2 < np.median(scores) < 1.8  # of two components: 0.69
+    assert 0.1 < np.median(scores) < 3.0  # of two components: 0.69
 
 
 def test_what_is_shared_over_less_than_the_edges_only_counts_points(rng: np.random.Generator) -> None:
