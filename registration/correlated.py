@@ -77,7 +77,7 @@ class CorrelatedNoise:
 
     def reaches(self, points: Floats) -> float:
         """Part of the points that lie about as near to the points that carry it as these do to each other."""
-        return float((_nearness(points, self.centres, self.length).max(axis=1) > _NEAR).mean())
+        return float((self.near(points).max(axis=1) > _NEAR).mean())
 
     @property
     def count(self) -> int:
@@ -139,7 +139,7 @@ class Linear:
 
     def some(self) -> Linear:
         """So few points that their covariance is at hand."""
-        every = slice(None, None, -(-len(self.data) // _ASKED))
+        every = slice(None, None, max(1, -(-len(self.data) // _ASKED)))
         names = ("points", "normals", "data", "forces", "beside", "left_out", "weights")
         return Linear(**{name: getattr(self, name)[every] for name in names})
 

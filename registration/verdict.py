@@ -156,10 +156,9 @@ def _of_the_cloud(problem: Problem, found: Found, expected: Expectations) -> lis
 
 
 def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
-    noise, findings = found.posterior.scales.noise, []
-    match = found.trial.match
+    match, findings = found.trial.match, list[_Finding]()
     by_patches = problem.shared_noise(found.trial)
-    noise = float(np.hypot(noise, np.sqrt(np.mean(by_patches**2))))
+    noise = float(np.hypot(found.posterior.scales.noise, np.sqrt(np.mean(by_patches**2))))
     if noise > expected.noise:
         verdict = Verdict.REFUSED if noise > 1.5 * expected.noise else Verdict.DOUBTFUL
         findings.append(

@@ -90,6 +90,7 @@ def test_a_spot_and_a_handful_of_points_tell_nothing(rng: np.random.Generator) -
     noise, force = Scale(5e-4, 1.5, least=1e-4), Scale(1e-3, 1.0)
     few = sphere(20, rng)
     assert find_correlated(linear(few[:, 0], few), noise, force, -99.0) is None
+    assert find_correlated(linear(np.zeros(0), few[:0]), noise, force, -99.0) is None  # all were outliers
     spot = np.tile(few[:1], (50, 1))
     assert find_correlated(linear(np.ones(50), spot), noise, force, -99.0) is None
 
