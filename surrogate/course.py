@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from .checkpoint import VERSION
 from .plan import TrainingPlan
-from .precision import forbid_tf32, without_tf32
+from .precision import forbid_onednn, forbid_tf32, without_onednn, without_tf32
 
 ROUNDS = 40  # a round ends with a look at the validation split and a checkpoint
 _WARM_UP = 200  # steps over which the learning rate rises
@@ -148,6 +148,8 @@ class Course(lightning.LightningModule):
         _hush()
         if self.plan.precision == "single":
             forbid_tf32()
+        elif chosen_device(self.plan) == "cpu":
+            forbid_onednn()
 
     @property
     def share(self) -> float:
@@ -291,14 +293,16 @@ def fit(course: Course, path: Path, resume: bool, log: bool = False) -> None:
         resume: go on from it.
         log: leave a line for each round beside it, as CSV and for TensorBoard, in a folder of its own for each run.
     """
-    with _quiet(), _interruptible(), without_tf32(course.plan.precision == "single"):
+    device, is_single = chosen_device(course.plan), course.plan.precision == "single"
+    kernels = without_onednn(device == "cpu" and not is_single)
+    with _quiet(), _interruptible(), without_tf32(is_single), kernels:
         keeper = ModelCheckpoint(
             dirpath=path.parent,
             filename=path.stem,
             save_on_train_epoch_end=True,
             enable_version_counter=False,
         )
-        device, several = chosen_device(course.plan), course.plan.processes > 1
+        several = course.plan.processes > 1
         trainer = lightning.Trainer(
             accelerator="gpu" if device == "cuda" else "cpu",
             devices=course.plan.processes,

@@ -200,6 +200,23 @@ def test_single_precision_is_without_tf32(
         assert torch.backends.cuda.matmul.allow_tf32 and torch.backends.cudnn.allow_tf32
 
 
+@pytest.mark.parametrize(("precision", "allowed"), [("single", True), ("mixed", False)])
+def test_bfloat16_on_a_processor_is_without_onednn(
+    data: DataSet, short: TrainingPlan, monkeypatch: pytest.MonkeyPatch, precision: Any, allowed: bool
+) -> None:
+    seen, step = set(), Course.training_step
+
+    def looking(course: Course, batch: Any, number: int) -> Any:
+        seen.add(torch.backends.mkldnn.enabled)
+        return step(course, batch, number)
+
+    monkeypatch.setattr(Course, "training_step", looking)
+    assert torch.backends.mkldnn.enabled
+    train(data, replace(short, precision=precision, device="cpu"))
+    assert seen == {allowed}
+    assert torch.backends.mkldnn.enabled
+
+
 STOPPED: dict[str, Architecture | None] = {
     "reduced": None,
     "mlp": Perceptron(16, "tanh"),
