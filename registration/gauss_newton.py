@@ -210,7 +210,9 @@ class _Search:
         while len(self.trace) < self.options.max_iterations:
             local = self._local(loss)
             if local.length < settled and not local.is_graduated:
-                if is_handed_on or is_exact or self._is_closest(local, settled):
+                if is_handed_on or is_exact:
+                    return Outcome.CONVERGED
+                if self._is_closest(local, settled) and self._local(loss).length < self.options.enough:
                     return Outcome.CONVERGED
                 is_exact = True
                 continue
