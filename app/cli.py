@@ -281,10 +281,14 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
 )
 @click.option("--landmark-deviation", type=float, help="Standard deviation of where --marks were found, metres.")
 @click.option(
-    "--pose", type=click.Choice(["fixed", "unknown"]), help="Unknown: found with the forces, as after any start."
+    "--pose",
+    type=click.Choice(["fixed", "unknown"]),
+    help="Unknown: found with the forces, as after any start. Fixed: exactly as given.",
 )
 @click.option("--pose-turn", type=float, help="How far an unknown pose may turn from its start, degrees.")
 @click.option("--pose-shift", type=float, help="How far an unknown pose may shift from its start, metres.")
+@click.option("--known-turn", type=float, help="How well a pose that is not asked for is known, degrees; 0: exactly.")
+@click.option("--known-shift", type=float, help="The same of its shift, metres.")
 @click.option(
     "--format",
     "formats",

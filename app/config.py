@@ -266,7 +266,9 @@ class RegistrationSection(_Section):
         0, ge=0, description="most iterations; 0: what the solver is content with (gauss-newton 40, l-bfgs 200 a run)"
     )
     pose: Literal["auto", "fixed", "unknown"] = Field(
-        "auto", description="whether the camera's pose is an unknown beside the forces; auto: where a start is given"
+        "auto",
+        description="whether the camera's pose is an unknown beside the forces; auto: where a start is given, and else "
+        "the clouds are in the organ's coordinates, as well as known_turn and known_shift say",
     )
     forces: Literal["unknown", "known"] = Field(
         "unknown", description="known: none beside known_forces, gravity and pressure; the unknowns are to be found"
@@ -279,6 +281,18 @@ class RegistrationSection(_Section):
     pressure: float = Field(0.0, description="on the whole boundary, pascals, following it (pneumoperitoneum)")
     pose_turn: Positive = Field(5.0, description="how far an unknown pose may turn from its start, degrees")
     pose_shift: Positive = Field(0.01, description="how far an unknown pose may shift from its start, metres")
+    known_turn: float = Field(
+        1.0,
+        ge=0.0,
+        allow_inf_nan=False,
+        description="how well a pose that is not asked for is known, degrees; 0: exactly",
+    )
+    known_shift: float = Field(
+        0.002,
+        ge=0.0,
+        allow_inf_nan=False,
+        description="the same of its shift, metres; what it is found to be off by counts as displacement",
+    )
     landmark_deviation: Positive = Field(
         0.002, description="standard deviation of where landmarks were found that pull beside the clouds, metres"
     )

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.metrics import target_errors
 from softtwin.registration.conditions import WITHIN_90
+from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registration
 from softtwin.registration.verdict import Verdict
 
@@ -26,6 +27,7 @@ from .twin import Frame, Twin
 Floats = NDArray[np.float64]
 NOTICE = "Research software: not a medical device."
 RECORD = "registration.json"
+_ASKEW = 0.01  # chance of a pose as far from the one said, if that were right: with less, the line says so
 _TOLD = 0.5  # of the variance beforehand: less is called not told
 _EVERY, _SHARE = 1.0, 0.05  # at least so many seconds between two writings, and at most this share of the time on them
 
@@ -176,6 +178,13 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "evaluations": result.evaluations,
         "solve_seconds": result.seconds,
     }
+    if result.problem.pose is not None and result.problem.pose.is_said:
+        centre, askew = result.problem.pose.centre, result.askew
+        row["askew"] = {
+            "turn_rad": askew.angle_to(Pose.identity()),
+            "shift_m": float(np.linalg.norm(askew.apply(centre) - centre)),
+            "chance": result.chance_of_pose,
+        }
     shared = result.problem.correlated
     if shared is not None:
         row["shared_noise"] = {"size_m": shared.size, "length_m": shared.length}
@@ -261,6 +270,9 @@ def describe(row: Mapping[str, Any]) -> str:
     if "shared_noise" in row:
         size, length = (row["shared_noise"][name] for name in ("size_m", "length_m"))
         line += f", of which neighbours within {millimetres(length, 0)} share noise of {millimetres(size)}"
+    if "askew" in row and row["askew"]["chance"] < _ASKEW:
+        shift, turn = millimetres(row["askew"]["shift_m"]), np.rad2deg(row["askew"]["turn_rad"])
+        line += f", pose {shift} and {turn:.1f} degrees from where it was said"
     line += f", {row['landmarks']} landmarks" if "landmarks" in row else ""
     line += (
         f", net force {force:.3f} ± {doubt:.3f} N" if force > 0.0 or doubt > 0.0 else ""

@@ -63,7 +63,8 @@ Engine = Registrar | HybridRegistrar | ContactRegistrar
 DOUBT = "doubt.npz"  # in a twin: what its organ may be otherwise
 Camera = Pose | PosePrior | Literal["align"] | None
 """Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
-is first looked for in the clouds themselves, None for clouds in the coordinates of the body at rest."""
+is first looked for in the clouds themselves, None for clouds in the coordinates of the body at rest, as well as the
+configuration's `known_turn` and `known_shift` say."""
 
 
 Landmarks = tuple[ArrayLike, ArrayLike]
@@ -253,6 +254,7 @@ class Twin:
         """
         if camera == "align":
             camera = self.aligned(cloud)
+        camera = camera or self.as_said
 
         def run(registrar: Engine, points: Floats) -> Registration:
             return self._marked(registrar, landmarks, landmark_deviation, camera).register(points, start)
@@ -278,6 +280,7 @@ class Twin:
             until: no step is begun after this time of the monotonic clock, seconds.
             landmarks: as for `register`.
         """
+        camera = camera or self.as_said
 
         def run(registrar: Engine, points: Floats) -> Registration:
             limited = registrar.limited(until) if until < np.inf else registrar
@@ -383,12 +386,25 @@ class Twin:
     def near(self, pose: Pose) -> PosePrior:
         """An unknown pose about an expected one, with the deviations of the configuration."""
         options = self.config.registration
-        return PosePrior(
-            pose,
-            outer(self.body).rest.points[np.unique(self._seen)].mean(axis=0),
-            np.deg2rad(options.pose_turn),
-            options.pose_shift,
-        )
+        return PosePrior(pose, self._middle, np.deg2rad(options.pose_turn), options.pose_shift)
+
+    @cached_property
+    def as_said(self) -> PosePrior | None:
+        """The pose of clouds that are said to be in the body's coordinates; None where that holds exactly.
+
+        Under known forces it does: what the pose is off by would be taken for stiffness.
+        """
+        options = self.config.registration
+        turn, shift = np.deg2rad(options.known_turn), options.known_shift
+        if options.pose == "fixed" or options.forces == "known" or 0.0 in (turn, shift):
+            return None
+        return PosePrior(Pose.identity(), self._middle, turn, shift, is_said=True)
+
+    @property
+    def _middle(self) -> Floats:
+        """Of what a camera sees, (3,), metres."""
+        middle: Floats = outer(self.body).rest.points[np.unique(self._seen)].mean(axis=0)
+        return middle
 
     def registrar(self, zone: str | None = None, camera: PosePrior | None = None) -> Engine:
         """What registers clouds with forces in a zone; prepared once (about a second), then kept.

@@ -11,6 +11,7 @@ from functools import cache, cached_property, reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import check_cloud
@@ -185,10 +186,12 @@ class Registration:
         trial: where the solver ended; the next frame starts there.
         forces: nodal forces, (n, 3), newtons.
         state: the body's state as the model has it, with its derivatives.
-        correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres.
+        correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres; with
+            it what a pose that was said to be known is off by.
         doubt: how large the model's error was found, in units of its samples'; 1 where it is not known in patterns.
         alike: so many points tell what one would that errs by itself; 1 where each does.
         pose: from the body's coordinates to the cloud's.
+        askew: what a pose that was said to be known is off by: a motion in the body's coordinates.
         net_force: (3,), newtons.
         net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
         noise: standard deviation of a point's distance that was found, metres.
@@ -217,6 +220,7 @@ class Registration:
     doubt: float
     alike: float
     pose: Pose
+    askew: Pose
     net_force: Floats
     net_force_covariance: Floats
     noise: float
@@ -268,6 +272,16 @@ class Registration:
         if conditions is None:
             return ()
         return conditions.estimates(self.coefficients[part], self.posterior.covariance[part, part])
+
+    @cached_property
+    def chance_of_pose(self) -> float:
+        """Chance that a pose which is just as expected seems so far from it; 1 where none is unknown.
+
+        The distance between the two in the posterior's deviations, against chi-square's law.
+        """
+        part = self.problem.pose_part
+        off, covariance = self.coefficients[part], self.posterior.covariance[part, part]
+        return float(chi2.sf(off @ np.linalg.solve(covariance, off), len(off))) if len(off) else 1.0
 
     @cached_property
     def force_over_modulus(self) -> tuple[Floats, Floats] | None:
@@ -778,6 +792,12 @@ class Registrar:
         check_cloud(given.points, self.model.body)
         return given
 
+    def _told_in(self, pose: Pose) -> tuple[Pose, Pose]:
+        """The pose that a result is told in, and what the one found is beside it: a motion of the body."""
+        if self.pose is None or not self.pose.is_said:
+            return pose, Pose.identity()
+        return self.pose.mean, pose.then(self.pose.mean.inverse())
+
     def _result(self, problem: Problem, found: Found, prepared: Prepared, begin: float, doubt: float) -> Registration:
         alike = found.local.alike()
         found = replace(found, posterior=found.local.posterior(alike))
@@ -787,15 +807,19 @@ class Registrar:
         covariance = found.posterior.net_force_covariance(net, prepared.forces.left_out)
         covariance += self.modulus_deviation**2 * total[:, None] * total
         state = trial.state.full
+        pose, askew = self._told_in(trial.pose or Pose.identity())
+        correction = problem.correction(trial)
+        moved = self.model.body.points + state.displacement + correction
         return Registration(
             prepared=prepared,
             trial=trial,
             forces=nodal,
             state=state,
-            correction=problem.correction(trial),
+            correction=correction + (askew.apply(moved) - moved),
             doubt=doubt,
             alike=alike,
-            pose=trial.pose or Pose.identity(),
+            pose=pose,
+            askew=askew,
             net_force=total,
             net_force_covariance=covariance,
             noise=found.posterior.scales.noise,

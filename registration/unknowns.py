@@ -257,12 +257,14 @@ class PosePrior:
         centre: of the turn, in the body's coordinates, (3,), metres.
         turn: standard deviation of the turn about each axis, radians.
         shift: standard deviation of the shift along each axis, metres.
+        is_said: the expected pose is the one that results are told in: what is found beside it counts as displacement.
     """
 
     mean: Pose
     centre: Floats
     turn: float = np.deg2rad(5.0)
     shift: float = 0.01
+    is_said: bool = False
 
     def __post_init__(self) -> None:
         for name in ("turn", "shift"):

@@ -279,9 +279,8 @@ def _of_the_pose(problem: Problem, found: Found, expected: Expectations) -> list
     largest = float(np.abs(found.trial.coefficients[problem.pose_part]).max())
     if largest <= expected.pose:
         return []
-    return [
-        (Verdict.DOUBTFUL, f"the pose lies {largest:.1f} deviations from where it was expected; give a better start")
-    ]
+    advice = "say --pose unknown" if problem.pose.is_said else "give a better start"
+    return [(Verdict.DOUBTFUL, f"the pose lies {largest:.1f} deviations from where it was expected; {advice}")]
 
 
 def _of_the_conditions(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:

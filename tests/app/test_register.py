@@ -335,6 +335,8 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
         "pose": "fixed",
         "pose_turn": 3.0,
         "pose_shift": 0.02,
+        "known_turn": 0.5,
+        "known_shift": 1e-3,
         "landmark_deviation": 1e-3,
         "penalty": "amplitude",
         "alpha": 0.2,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from softtwin.app.config import Config, ConfigError, to_toml
 from softtwin.app.twin import Twin
@@ -68,10 +69,46 @@ def test_a_zone_that_is_not_there_is_named(plain_twin: Twin) -> None:
 
 def test_a_known_camera_changes_nothing_but_coordinates(plain_twin: Twin, forces) -> None:
     cloud = seen_cloud(plain_twin, forces)
-    plain, seen = plain_twin.register(cloud), plain_twin.register(TURNED.apply(cloud), camera=TURNED)
+    plain = plain_twin.register(cloud, camera=Pose.identity())
+    seen = plain_twin.register(TURNED.apply(cloud), camera=TURNED)
     assert seen.pose is TURNED
     # Both have converged: a further step is shorter than a fifth of what is uncertain.
     assert (np.abs(seen.net_force - plain.net_force) < 0.2 * plain.net_force_deviation).all()
+
+
+@pytest.mark.parametrize("off", [0.0, 1.0])
+def test_a_pose_that_nobody_asks_for_is_known_to_a_few_millimetres(plain_twin: Twin, forces, off: float) -> None:
+    """What it is off by is displacement, within the margins; exactly known, it makes a wrong organ."""
+    turn = Rotation.from_rotvec(off * np.deg2rad(0.7) * np.array([0.0, 0.6, 0.8])).as_matrix()
+    moved = Pose(turn, off * np.array([1e-3, -2e-3, 2e-3]))
+    cloud = moved.apply(seen_cloud(plain_twin, forces))
+    rest = plain_twin.body.points
+    truth = moved.apply(rest + plain_twin.predict(forces).displacement) - rest
+    free = np.setdiff1d(np.arange(len(rest)), plain_twin.body.fixed)
+    errors, covered = {}, {}
+    for name, camera in (("as said", None), ("exactly", Pose.identity())):
+        found = plain_twin.register(cloud, camera=camera)
+        away = np.linalg.norm(found.displacement - truth, axis=1)
+        errors[name], covered[name] = away[free].mean(), np.mean(away <= found.uncertainty.margin())
+        assert found.pose.distance_to(Pose.identity(), rest) == 0.0
+        found_off = found.askew.distance_to(Pose.identity(), rest)
+        assert (found_off > 0.0) == (name == "as said")
+    assert covered["as said"] > 0.9
+    if off:
+        assert errors["as said"] < 0.5 * errors["exactly"] and covered["exactly"] < 0.5
+        assert found.chance_of_pose == 1.0
+
+
+def test_who_knows_the_pose_exactly_says_so(plain_twin: Twin) -> None:
+    assert plain_twin.as_said is not None
+    for entries in (
+        {"pose": "fixed"},
+        {"known_turn": 0.0},
+        {"known_shift": 0.0},
+        {"model": "reference", "forces": "known", "gravity": [0.0, 0.0, -9.81], "unknowns": ["young-modulus"]},
+    ):
+        twin = Twin(plain_twin.model, Config.model_validate({"registration": entries}))
+        assert twin.as_said is None
 
 
 @pytest.mark.parametrize("camera", [None, TURNED])
