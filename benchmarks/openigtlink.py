@@ -142,7 +142,7 @@ def main() -> None:
                 rows[f"network, {kind}"] = measured(twin, cloud, kind, arguments.rounds, False, folder)
         if arguments.twin is not None:
             cloud = np.load(arguments.twin / "demo" / "cloud.npy")
-            with Twin.open(arguments.twin) as twin:
+            with Twin.open(arguments.twin, pose="fixed") as twin:
                 rows["registered"] = measured(twin, cloud, "POINT", arguments.rounds, True, folder)
     for row, figures in rows.items():
         print(f"{row}: {figures['surface_vertices']} vertices, {figures['rate_hz']:.1f} Hz, {figures['round_ms']}")

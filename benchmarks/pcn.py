@@ -228,7 +228,7 @@ def main() -> None:
     parser.add_argument("--name", default=NAME, help="of the record")
     arguments = parser.parse_args()
     found, made = recorded(arguments.name), truths(DataSet(arguments.folder / "data.zarr"), arguments.frames)
-    with threadpool_limits(1), Twin.open(arguments.folder, "surrogate") as twin:
+    with threadpool_limits(1), Twin.open(arguments.folder, "surrogate", pose="fixed") as twin:
         for number, (_, truth) in enumerate(made):
             key = f"frame {number}, about {arguments.about}, {arguments.length} states"
             if key not in found:

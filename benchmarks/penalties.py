@@ -79,7 +79,7 @@ def main() -> None:
     given = truths(DataSet(arguments.folder / "data.zarr"), arguments.loads)
     for label, options in ROWS.items():
         if label not in found:
-            with threadpool_limits(1), Twin.open(arguments.folder, "surrogate", **options) as twin:
+            with threadpool_limits(1), Twin.open(arguments.folder, "surrogate", pose="fixed", **options) as twin:
                 found[label] = summary([one(twin, *pair, seed) for seed, pair in enumerate(given)])
             write(arguments.name, found)
         print(label, found[label], flush=True)

@@ -56,7 +56,7 @@ def main() -> None:
     truth = np.load(arguments.folder / "demo" / "truth.npy")
     own = np.load(arguments.folder / "demo" / "cloud.npy")
     rows: list[dict[str, Any]] = []
-    with threadpool_limits(1), Twin.open(arguments.folder) as twin:
+    with threadpool_limits(1), Twin.open(arguments.folder, pose="fixed") as twin:
         body = twin.body
 
         def seen(count: int, seed: int) -> Floats:

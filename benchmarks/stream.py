@@ -53,7 +53,7 @@ def main() -> None:
         (1.0 - share) * a + share * b for a, b in zip(states, states[1:] + states[:1], strict=True) for share in shares
     ]
     rng = np.random.default_rng(0)
-    with threadpool_limits(1), Twin.open(arguments.folder, arguments.engine) as twin:
+    with threadpool_limits(1), Twin.open(arguments.folder, arguments.engine, pose="fixed") as twin:
         clouds = [partial_view(twin.body, u, CAMERA, POINTS, NOISE, rng, surface="observed") for u in path]
         sequence = Sequence(twin, "")
         sequence.register(clouds[0])  # everything is prepared

@@ -418,14 +418,14 @@ def margins() -> None:
     if not found:
         return
     covered = "nodes covered by 50 / 90 / 95 % margins"
-    head("margins", "error; predicted mm", "r", covered, "tumour", "its 95 % margin mm", "median s")
+    head("margins", "error; predicted mm", "r; at best", covered, "tumour", "its 95 % margin mm", "median s")
     for key, f in found.items():
         told = f["summary"]
         tumour = told["structures"]["tumour"]
         row(
             key,
             f"{told['error_mm']:.2f}; {told['predicted_mm']:.2f}",
-            f"{told['correlation']:.2f}",
+            f"{told['correlation']:.2f}; {told['correlation_at_best']:.2f}",
             " / ".join(f"{100 * share:.0f}" for share in told["nodes_covered"].values()),
             " / ".join(f"{100 * share:.0f}" for share in tumour["covered"].values()),
             f"{tumour['margin95_mm']:.2f}",
