@@ -90,7 +90,7 @@ def test_they_pull_from_files_as_from_arrays(tmp_path: Path, plain_twin: Twin, s
 
 def test_they_turn_with_the_camera(plain_twin: Twin, seen: np.ndarray) -> None:
     pose = Pose.identity().moved(np.array([0.3, -0.2, 0.5, 0.02, 0.01, -0.03]), np.zeros(3))
-    here = plain_twin.register(seen)
+    here = plain_twin.register(seen, camera=Pose.identity())
     there = plain_twin.register(turned(seen, pose.rotation, pose.translation), camera=pose)
     # Rounding decides to which of two triangles a point at their edge belongs, and each search may have a tenth to go.
     away = np.linalg.norm(there.displacement - here.displacement, axis=1)

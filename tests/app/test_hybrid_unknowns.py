@@ -76,7 +76,7 @@ def test_known_forces_are_told_from_unknown_ones(small_quickstart: Path, tmp_pat
     cloud = seen(body, solved(body, known + load))
     found = {}
     for path in (str(tmp_path / "known.npy"), ""):
-        with Twin.open(small_quickstart, "hybrid", known_forces=path) as twin:
+        with Twin.open(small_quickstart, "hybrid", known_forces=path, pose="fixed") as twin:
             found[path] = twin.register(cloud, "")
             assert twin.bounded(found[path]) is None or not path  # no bound of a network that is asked otherwise
     told, silent = found.values()

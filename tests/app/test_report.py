@@ -179,6 +179,7 @@ def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[s
                 doubt=1.0,
                 alike=1.0,
                 pose=Pose.identity(),
+                askew=Pose.identity(),
                 net_force=np.array([0.0, 0.3, 0.4]),
                 net_force_covariance=1e-4 * np.eye(3),
                 noise=5e-3 if refused else 5e-4,
@@ -192,7 +193,7 @@ def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[s
                 evaluations=5,
                 seconds=0.1,
                 trace=(),
-                problem=SimpleNamespace(correlated=None),  # type: ignore[arg-type]
+                problem=SimpleNamespace(correlated=None, pose=None),  # type: ignore[arg-type]
                 posterior=None,  # type: ignore[arg-type]
             )
             vars(result).update(
