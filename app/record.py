@@ -27,7 +27,7 @@ from .twin import Frame, Twin
 Floats = NDArray[np.float64]
 NOTICE = "Research software: not a medical device."
 RECORD = "registration.json"
-_ASKEW = 0.01  # chance of a pose as far from the one said, if that were right: with less, the line says so
+_ASKEW = 0.01  # chance of a pose as far from the one said, if that were right: with less, it is seen to be off
 _TOLD = 0.5  # of the variance beforehand: less is called not told
 _EVERY, _SHARE = 1.0, 0.05  # at least so many seconds between two writings, and at most this share of the time on them
 
@@ -184,6 +184,7 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
             "turn_rad": askew.angle_to(Pose.identity()),
             "shift_m": float(np.linalg.norm(askew.apply(centre) - centre)),
             "chance": result.chance_of_pose,
+            "is_seen": result.chance_of_pose < _ASKEW,
         }
     shared = result.problem.correlated
     if shared is not None:
@@ -270,7 +271,7 @@ def describe(row: Mapping[str, Any]) -> str:
     if "shared_noise" in row:
         size, length = (row["shared_noise"][name] for name in ("size_m", "length_m"))
         line += f", of which neighbours within {millimetres(length, 0)} share noise of {millimetres(size)}"
-    if "askew" in row and row["askew"]["chance"] < _ASKEW:
+    if row.get("askew", {}).get("is_seen"):
         shift, turn = millimetres(row["askew"]["shift_m"]), np.rad2deg(row["askew"]["turn_rad"])
         line += f", pose {shift} and {turn:.1f} degrees from where it was said"
     line += f", {row['landmarks']} landmarks" if "landmarks" in row else ""
