@@ -425,7 +425,8 @@ def margins() -> None:
         row(
             key,
             f"{told['error_mm']:.2f}; {told['predicted_mm']:.2f}",
-            f"{told['correlation']:.2f}; {told['correlation_at_best']:.2f}",
+            f"{told['correlation']:.2f}; "
+            + (f"{told['correlation_at_best']:.2f}" if "correlation_at_best" in told else "-"),
             " / ".join(f"{100 * share:.0f}" for share in told["nodes_covered"].values()),
             " / ".join(f"{100 * share:.0f}" for share in tumour["covered"].values()),
             f"{tumour['margin95_mm']:.2f}",
