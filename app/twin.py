@@ -390,11 +390,13 @@ class Twin:
 
     @cached_property
     def as_said(self) -> PosePrior | None:
-        """The pose of clouds that are said to be in the body's coordinates; None where that holds exactly.
+        """What the configuration believes of a pose that nobody gives; None where it is exactly the body's.
 
-        Under known forces it does: what the pose is off by would be taken for stiffness.
+        Under known forces it is: what the pose is off by would be taken for stiffness.
         """
         options = self.config.registration
+        if options.pose == "unknown":
+            return self.near(Pose.identity())
         turn, shift = np.deg2rad(options.known_turn), options.known_shift
         if options.pose == "fixed" or options.forces == "known" or 0.0 in (turn, shift):
             return None

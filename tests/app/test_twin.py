@@ -100,7 +100,10 @@ def test_a_pose_that_nobody_asks_for_is_known_to_a_few_millimetres(plain_twin: T
 
 
 def test_who_knows_the_pose_exactly_says_so(plain_twin: Twin) -> None:
-    assert plain_twin.as_said is not None
+    said = plain_twin.as_said
+    assert said is not None and said.is_said and (said.turn, said.shift) == pytest.approx((np.deg2rad(1.0), 2e-3))
+    sought = Twin(plain_twin.model, Config.model_validate({"registration": {"pose": "unknown"}})).as_said
+    assert sought is not None and not sought.is_said and sought.shift == pytest.approx(0.01)
     for entries in (
         {"pose": "fixed"},
         {"known_turn": 0.0},
