@@ -198,8 +198,8 @@ def test_large_clouds_are_thinned_and_answer_alike(body: Body, rng) -> None:
         large = made.register(cloud_on(body, truth, 50_000, rng, 1e-3))
         assert 500 < large.points <= made.options.most_points
         assert large.noise == pytest.approx(1e-3, rel=0.15)
-        missed.append(np.abs(large.displacement - truth).max())
-    assert np.median(missed) < 1e-3  # of many: along the beam hardly anything is seen, and one cloud proves nothing
+        missed.append(np.abs(large.displacement - truth)[:, 1:].max())  # along the beam hardly anything is seen
+    assert np.median(missed) < 5e-4  # of many: one cloud proves nothing
 
 
 @pytest.mark.parametrize("name", ["settled", "enough", "handed_on", "max_step", "least_step"])
