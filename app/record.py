@@ -178,14 +178,9 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "evaluations": result.evaluations,
         "solve_seconds": result.seconds,
     }
-    if result.problem.pose is not None and result.problem.pose.is_said:
-        centre, askew = result.problem.pose.centre, result.askew
-        row["askew"] = {
-            "turn_rad": askew.angle_to(Pose.identity()),
-            "shift_m": float(np.linalg.norm(askew.apply(centre) - centre)),
-            "chance": result.chance_of_pose,
-            "is_seen": result.chance_of_pose < _ASKEW,
-        }
+    askew = askew_of(result)
+    if askew is not None:
+        row["askew"] = askew
     shared = result.problem.correlated
     if shared is not None:
         row["shared_noise"] = {"size_m": shared.size, "length_m": shared.length}
@@ -227,6 +222,19 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         for name, points in twin.embeddings.items():
             row["targets"][name]["error_m"] = _mean_length(moved[name] - points.displace(truth - rest))
     return row
+
+
+def askew_of(result: Registration) -> dict[str, Any] | None:
+    """What a pose that was said to be known is off by, SI units; None for one that is exact, or unknown altogether."""
+    pose = result.problem.pose
+    if pose is None or not pose.is_said:
+        return None
+    return {
+        "turn_rad": result.askew.angle_to(Pose.identity()),
+        "shift_m": float(np.linalg.norm(result.askew.apply(pose.centre) - pose.centre)),
+        "chance": result.chance_of_pose,
+        "is_seen": result.chance_of_pose < _ASKEW,
+    }
 
 
 def _over_modulus(twin: Twin, result: Registration) -> tuple[Floats, Floats]:

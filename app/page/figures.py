@@ -38,6 +38,8 @@ class Figures:
         dropped: clouds that came and were never registered, in all.
         rate: answers a second.
         engine: that registers.
+        askew: by what the camera is seen to stand elsewhere than was said: a shift, and a turn in radians; None where
+            it is not.
     """
 
     title: str
@@ -55,6 +57,7 @@ class Figures:
     dropped: int = 0
     rate: float = np.nan
     engine: str = ""
+    askew: tuple[float, float] | None = None
 
 
 def figures_html(figures: Figures) -> str:
@@ -129,6 +132,9 @@ def _others(figures: Figures) -> str:
         rows.append(("net force", f"{figures.net_force:.2f}{doubt} N"))
     if np.isfinite(figures.true_net_force):
         rows.append(("true net force", f"{figures.true_net_force:.2f} N"))
+    if figures.askew is not None:
+        shift, turn = figures.askew
+        rows.append(("camera elsewhere by", f"{_mm(shift)}, {np.rad2deg(turn):.1f}°"))
     for name, seconds in (("frame time", figures.frame_time), ("age of the answer", figures.age)):
         if np.isfinite(seconds):
             rows.append((name, f"{1e3 * seconds:.0f} ms"))

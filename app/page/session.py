@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registration
 
+from ..record import askew_of
 from ..register import registered
 from ..streams import Arrival, Mailbox, fed
 from ..twin import Camera, Frame, Home, Sequence, Twin
@@ -183,11 +184,14 @@ class Session:
         found, judgement = frame.registration, frame.judgement
         reason = judgement.reasons[0] if judgement.reasons else ""
         if found is None:
-            self._figures = replace(self._figures, verdict=judgement.verdict, reason=reason, margins={}, errors={})
+            self._figures = replace(
+                self._figures, verdict=judgement.verdict, reason=reason, margins={}, errors={}, askew=None
+            )
             self.controls.show(self._figures)
             return
         self._forces = found.forces
         margins, errors = margins_of(twin, found), errors_of(twin, found, shot.truth)
+        off = askew_of(found)
         self._figures = replace(
             self._figures,
             verdict=judgement.verdict,
@@ -197,6 +201,7 @@ class Session:
             net_force=float(np.linalg.norm(found.net_force)),
             net_force_deviation=float(np.linalg.norm(found.net_force_deviation)),
             true_net_force=np.nan if shot.net_force is None else float(np.linalg.norm(shot.net_force)),
+            askew=None if off is None or not off["is_seen"] else (off["shift_m"], off["turn_rad"]),
         )
         self.brush.glide(found.displacement)
         self._paint(found, frame, shot, wishes, twin)

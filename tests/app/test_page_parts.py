@@ -103,7 +103,9 @@ def test_figures_have_their_units_and_what_is_unknown_is_said_to_be() -> None:
     )  # fmt: skip
     for words in ("doubtful", "a &lt;reason&gt;", "1.2 mm", "0.4 mm", "unknown", "0.50 ± 0.10 N", "40 ms", "60 ms"):
         assert words in text
-    assert "nan" not in text and "inf" not in text
+    assert "nan" not in text and "inf" not in text and "camera" not in text
+    elsewhere = figures_html(Figures("registration", Verdict.ACCEPTED, askew=(3.21e-3, np.deg2rad(1.24))))
+    assert "camera elsewhere by" in elsewhere and "3.2 mm, 1.2°" in elsewhere
     assert "above 4 mm" in legend_html(SCALES["error"], has_untold=False)
 
 

@@ -81,6 +81,15 @@ def test_an_iterator_of_clouds_is_shown_without_a_truth(told: list[Figures]) -> 
     assert found.frame_time > 0 and found.age >= found.frame_time
 
 
+def test_a_camera_that_stands_elsewhere_than_was_said_is_told(told: list[Figures]) -> None:
+    cloud = next(shots(1)).cloud
+    show(PHANTOM, [cloud], browser=False, say=lambda _: None)  # type: ignore[list-item]
+    assert answered(told)[-1].askew is None
+    show(PHANTOM, [cloud + [0.0, 0.0, 8e-3]], browser=False, say=lambda _: None)  # type: ignore[list-item]
+    askew = answered(told)[-1].askew
+    assert askew is not None and 2e-3 < askew[0] < 10e-3
+
+
 @pytest.mark.parametrize(
     "opened",
     [lambda say: run_demo(browser=False, say=say), lambda say: show(PHANTOM, [], browser=False, say=say)],
