@@ -276,13 +276,13 @@ def checked_network() -> None:
                 )
 
 
-def beam_registration() -> None:
+def beam_registration(name: str) -> None:
     """Table 6.1: the thesis's beam registered with a network."""
-    found = recorded("beam_registration")
+    found = recorded(name)
     if not found:
         return
     head(
-        "beam_registration",
+        name,
         "cases; failed",
         "mean nodal mm",
         "largest mm",
@@ -344,6 +344,16 @@ def liver_engines() -> None:
             f"{told['median_seconds']:.3f} ({told['longest_seconds']:.2f}); "
             + " / ".join(f"{seconds:.2f}" for seconds in told["cold"]["seconds"]),
         )
+
+
+def other_mesh() -> None:
+    """What another mesh of the real liver can do at all."""
+    found = recorded("other_mesh")
+    if not found:
+        return
+    head("other_mesh", "moved mm", "under the true forces, mm", "at best, mm")
+    for name, f in found["sequences"].items():
+        row(name, *(f"{f[kind]:.2f}" for kind in ("moved_mm", "carried_mm", "at_best_mm")))
 
 
 def pose_noise() -> None:
@@ -611,8 +621,10 @@ def print_all() -> None:
     hybrid()
     certificates()
     checked_network()
-    beam_registration()
+    beam_registration("beam_registration")
+    beam_registration("beam_registration_now")
     liver_engines()
+    other_mesh()
     pose_noise()
     calibration()
     penalties()

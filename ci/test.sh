@@ -12,6 +12,7 @@ if [ ! -x /usr/bin/chromium ] && command -v apt-get >/dev/null; then
         --no-install-recommends chromium; } </dev/null ||
         say "chromium could not be installed: the page is tried in no browser"
 fi
+export OMP_NUM_THREADS=1 # torch's networks here are small: on cores that others use, its threads wait for each other
 export PATH="$VENV/bin:$PATH" PYTHONUNBUFFERED=1 # unbuffered, or a test that forks prints the lines before it twice
 LOGS="$ROOT/build/ci"
 rm -rf "$LOGS" && mkdir -p "$LOGS"

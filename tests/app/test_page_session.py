@@ -85,7 +85,7 @@ def test_a_camera_that_stands_elsewhere_than_was_said_is_told(told: list[Figures
     cloud = next(shots(1)).cloud
     show(PHANTOM, [cloud], browser=False, say=lambda _: None)  # type: ignore[list-item]
     assert answered(told)[-1].askew is None
-    show(PHANTOM, [cloud + [0.0, 0.0, 8e-3]], browser=False, say=lambda _: None)  # type: ignore[list-item]
+    show(PHANTOM, [cloud + np.array([0.0, 0.0, 8e-3])], browser=False, say=lambda _: None)  # type: ignore[list-item]
     askew = answered(told)[-1].askew
     assert askew is not None and 2e-3 < askew[0] < 10e-3
 
