@@ -394,6 +394,24 @@ class Conditions:
             begin += unknown.count
         return None
 
+    def growth(self, coefficients: Floats) -> tuple[float, Floats]:
+        """Factor by which forces grow with the whole body's Young's modulus, and its derivative, (count,).
+
+        Forces are expected of a size for a stiffness: a body twice as stiff is pulled at twice as hard. Were they
+        expected in newtons, the most probable body would be too soft, since a softer one needs less of them.
+
+        Args:
+            coefficients: (count,).
+        """
+        slopes, modulus = np.zeros(self.count), self.modulus
+        if modulus is None:
+            return 1.0, slopes
+        place, deviation = modulus
+        least = LEAST_MODULUS / float(np.mean(self.parameters["young_modulus"]))
+        grown = (1.0 - least) * float(np.exp(deviation * coefficients[place]))
+        slopes[place] = deviation * grown
+        return least + grown, slopes
+
     @property
     def has_regions(self) -> bool:
         """Whether the stiffness of a part of the body is an unknown of its own."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -153,7 +154,7 @@ class _PickedState:
         if self.model.count == 0:
             return np.zeros((len(self.model.rows), 0))
         pushed: Floats = self.full.push(self.model.basis)[self.model.rows]
-        return pushed
+        return self.model.growth(self.unknown)[0] * pushed
 
     def jacobian(self, rows: csr_array) -> Floats:
         return rows @ self._basis_pushed
@@ -166,6 +167,9 @@ class _PickedState:
         conditions = self.model.conditions
         assert conditions is not None
         changes = conditions.changes(self.unknown)
+        forces, (_, slopes) = self.model.forces(self.coefficients), self.model.growth(self.unknown)
+        for place in np.flatnonzero(slopes):
+            changes[place] = replace(changes[place], forces=slopes[place] * forces)
         if conditions.has_forces_alone:
             pushed: Floats = self.full.push(
                 np.stack([np.asarray(change.forces, dtype=np.float64).ravel() for change in changes], axis=1)
@@ -197,6 +201,15 @@ class _PickedModel:
     def count(self) -> int:
         return self.basis.shape[1]
 
+    def forces(self, coefficients: Floats) -> Floats:
+        """Nodal forces, (n, 3), newtons, on a body as stiff as expected."""
+        found: Floats = (self.basis @ coefficients).reshape(-1, 3)
+        return found
+
+    def growth(self, unknown: Floats) -> tuple[float, Floats]:
+        """See `Conditions.growth`."""
+        return (1.0, np.zeros(0)) if self.conditions is None else self.conditions.growth(unknown)
+
     def combined(self, matrix: Floats) -> _PickedModel:
         return _PickedModel(self.model, self.nodes, self.basis @ matrix, self.conditions)
 
@@ -206,7 +219,7 @@ class _PickedModel:
             unknown = np.zeros(0 if self.conditions is None else self.conditions.count)
         if isinstance(near, _PickedState) and near.is_at(self, coefficients, unknown):
             return near
-        forces = (self.basis @ coefficients).reshape(-1, 3)
+        forces = self.growth(unknown)[0] * self.forces(coefficients)
         start = None if near is None else near.full
         if self.conditions is None:
             return _PickedState(self, coefficients, unknown, self.model.solve(forces, start))

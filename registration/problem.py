@@ -373,7 +373,7 @@ class Problem:
         by_nodes = (rows.T @ cotangent).reshape(-1, 3)
         full = np.zeros_like(self.observed.body.points)
         full[self.observed.nodes] = by_nodes
-        blocks = [trial.state.full.pull(full).ravel() @ self.forces.basis]
+        blocks = [self.growth(trial)[0] * (trial.state.full.pull(full).ravel() @ self.forces.basis)]
         if by_pose is not None:
             blocks.append(cotangent @ by_pose)
         if self.conditions is not None:
@@ -411,9 +411,15 @@ class Problem:
             shifted = shifted + self.error.observed_field(change[self.error_part], every)
         return np.sqrt(np.einsum("pi,pi->p", shifted, shifted))
 
+    def growth(self, trial: Trial) -> tuple[float, Floats]:
+        """Factor by which forces grow with the body's stiffness, and its derivative by the conditions' coefficients."""
+        if self.conditions is None:
+            return 1.0, np.zeros(0)
+        return self.conditions.growth(trial.coefficients[self.condition_part])
+
     def nodal_forces(self, trial: Trial) -> Floats:
         """All that is unknown of the nodal forces, (n, 3), newtons."""
-        found = self.forces.forces(trial.coefficients[self.force_part])
+        found = self.growth(trial)[0] * self.forces.forces(trial.coefficients[self.force_part])
         if self.conditions is not None:
             found = found + self.conditions.forces(trial.coefficients[self.condition_part])
         return found
@@ -421,9 +427,12 @@ class Problem:
     def net_forces(self, trial: Trial) -> Floats:
         """Derivative of their net force by the coefficients, (3, k), newtons."""
         whole = np.zeros((3, self.size))
-        whole[:, self.force_part] = self.forces.net_basis
+        growth, slopes = self.growth(trial)
+        whole[:, self.force_part] = growth * self.forces.net_basis
         if self.conditions is not None:
-            whole[:, self.condition_part] = self.conditions.net_forces(trial.coefficients[self.condition_part])
+            net = self.forces.net_basis @ trial.coefficients[self.force_part]
+            own = self.conditions.net_forces(trial.coefficients[self.condition_part])
+            whole[:, self.condition_part] = own + net[:, None] * slopes
         return whole
 
     def is_too_far(self, change: Floats) -> bool:

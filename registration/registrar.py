@@ -253,7 +253,7 @@ class Registration:
 
     @property
     def unknown_forces(self) -> Floats:
-        """Nodal forces of the basis alone, (n, 3), newtons: without those of conditions."""
+        """Nodal forces of the basis, (n, 3), without those of conditions: newtons on a body as stiff as expected."""
         return self.prepared.forces.forces(self.coefficients[self.problem.force_part])
 
     @property

@@ -126,7 +126,7 @@ def uncertainty(problem: Problem, trial: Trial, posterior: Posterior, unseen: Fl
         unseen: response to the directions of force that were left out, as from `unseen_response`.
     """
     state = trial.state.full
-    blocks = [state.push(problem.forces.basis)] if problem.forces.size else []
+    blocks = [problem.growth(trial)[0] * state.push(problem.forces.basis)] if problem.forces.size else []
     if problem.pose is not None and trial.pose is not None:
         places = problem.observed.body.points + state.displacement + problem.correction(trial)
         in_camera = problem.pose.jacobian(trial.coefficients[problem.pose_part], places)

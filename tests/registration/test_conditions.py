@@ -57,6 +57,18 @@ def change_as_vector(change: Change, body: Body) -> np.ndarray:
     return np.concatenate([moduli, ratios, moved[body.node_sets["tip"]].ravel(), forces.ravel()])
 
 
+def test_forces_grow_with_the_bodys_stiffness_alone(body: Body, rng: np.random.Generator) -> None:
+    conditions, step = everything(body), 1e-6
+    at = 0.5 * rng.standard_normal(conditions.count)
+    growth, slopes = conditions.growth(at)
+    differences = [(conditions.growth(at + e)[0] - conditions.growth(at - e)[0]) / (2.0 * step)
+                   for e in step * np.eye(len(at))]  # fmt: skip
+    np.testing.assert_allclose(slopes, differences, atol=1e-8)
+    assert growth != 1.0 and np.flatnonzero(slopes).tolist() == [0] and conditions.growth(0.0 * at)[0] == 1.0
+    of_region = Conditions(body, conditions.parameters, conditions.unknowns[1:])
+    assert of_region.growth(at[1:])[0] == 1.0 and not of_region.growth(at[1:])[1].any()
+
+
 def test_the_inputs_derivatives_are_their_differences(body: Body, rng: np.random.Generator) -> None:
     conditions, step = everything(body), 1e-6
     at = 0.5 * rng.standard_normal(conditions.count)
@@ -235,6 +247,8 @@ def test_under_dead_forces_a_cloud_tells_forces_over_stiffness_alone(
         assert (np.abs(ratio - net / 6500.0) < 4.0 * doubt + 1e-2 * 1.0 / 6500.0).all()
         assert doubt[2] < 0.05 * abs(ratio[2])
         assert result.uncertainty.deviation.max() > 0.0
+        (modulus,) = result.estimates
+        assert modulus.value == pytest.approx(6500.0, rel=1e-3) and modulus.told < 0.02
         model.problem.close()
     assert found["badly"].net_force_deviation[2] > 0.25 * abs(found["badly"].net_force[2])
     assert found["well"].net_force_deviation[2] < 0.08 * abs(found["well"].net_force[2])
