@@ -622,7 +622,7 @@ def print_all() -> None:
     certificates()
     checked_network()
     beam_registration("beam_registration")
-    beam_registration("beam_registration_now")
+    beam_registration("beam_registration_tried")
     liver_engines()
     other_mesh()
     pose_noise()

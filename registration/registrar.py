@@ -44,7 +44,6 @@ _SPREAD = 0.5
 _SPREAD_ANYWHERE = 0.7  # where a cloud tells the size of forces of which most are none
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _GLANCE = 100  # points that this is seen from
-_NO_PULL, _HARDLY = 0.05, 0.01  # weight of an outlier, and a share of those that is hardly one
 _LEFT = 1.5  # times the noise of the frame before
 _SEARCHING = 0.7  # of the time that is left for a frame: the search from rest, whose end takes the others
 _DOUBTS, _SURE = 3, 0.1  # times that the model's error is scaled anew; not where that changes it by less
@@ -63,7 +62,7 @@ _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
 _MANY = 10_000  # points: of no cloud that is left after thinning are there more
 _CLEAR, _LOUD = 2.0, 1.5  # times the least noise, times the model's error
 _CLOSE = 0.01  # reach of a surrogate's forces whose zone is unknown: with more, their doubt is larger than their error
-_LEADING, _ROUGH = 6, 200  # directions of force that a cold start begins with, and points that are enough for them
+_LEADING = 6  # directions of force that a cold start begins with
 _ANCHORS = 3  # exact states from which a fast model goes on
 NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
 
@@ -659,12 +658,8 @@ class Registrar:
         """
         prepared, gathering, solver = self._everywhere, self.options.gathering, self.options.solver
         few, is_gathered = points.thinned(gathering.points), gathering.rounds > 0
-        if is_gathered:
-            found = self._from_rest(few, prepared, solver)
-        elif self.error is not None:
-            found = self._roughly(points, prepared)
-        else:
-            found = self._from_rest(points, prepared, solver.unsettled())
+        begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
+        found = self._from_rest(*begun)
         for left in reversed(range(gathering.rounds)):
             if self._is_hopeless(found) or self._is_late:
                 break
@@ -691,25 +686,17 @@ class Registrar:
 
     def _from_rest(self, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> Found:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
-        begun, problem = self._roughly(points, prepared), self._plain(points, prepared)
-        if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
-            solver = solver.without_steps()
-        return _after(begun, solver.solve(problem, begun.trial.coefficients.copy(), begun.trial))
-
-    def _roughly(self, points: Cloud, prepared: Prepared) -> Found:
-        """What few points and the leading directions alone say, in the coefficients of all."""
-        few, first = points.thinned(min(self.options.gathering.points, _ROUGH)), prepared.leading(_LEADING)
+        few, first = points.thinned(self.options.gathering.points), prepared.leading(_LEADING)
         rough, problem = self._plain(few, first), self._plain(points, prepared)
-        begun = self.options.solver.rough().solve(rough, np.zeros(rough.size))
+        begun = solver.rough().solve(rough, np.zeros(rough.size))
         start = np.zeros(problem.size)
         start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
-        for mine, its in (
-            (problem.pose_part, rough.pose_part),
-            (problem.condition_part, rough.condition_part),
-            (problem.noise_part, rough.noise_part),
-        ):
-            start[mine] = begun.trial.coefficients[its]
-        return replace(begun, trial=replace(begun.trial, coefficients=start))
+        start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
+        start[problem.condition_part] = begun.trial.coefficients[rough.condition_part]
+        start[problem.noise_part] = begun.trial.coefficients[rough.noise_part]
+        if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
+            solver = solver.without_steps()
+        return _after(begun, solver.solve(problem, start, begun.trial))
 
     def _finished(
         self, points: Cloud, prepared: Prepared, found: Found, begin: float, is_settled: bool = True
@@ -724,11 +711,11 @@ class Registrar:
         if self.error is not None or not is_settled:
             errors = np.zeros(problem.size - len(found.trial.coefficients))
             start = np.concatenate([found.trial.coefficients, errors])
-            found = _after(found, _onward(solver, found).solve(problem, start, found.trial))
+            found = _after(found, solver.solve(problem, start, found.trial))
         wider = self._believed(believed, found)
         if wider is not believed:  # seen only now that the model's error is told from noise
             believed, problem = wider, replace(problem, forces=wider.forces)
-            found = _after(found, _onward(solver, found).solve(problem, found.trial.coefficients, found.trial))
+            found = _after(found, solver.solve(problem, found.trial.coefficients, found.trial))
         if not is_hopeless:
             problem, found, doubt = self._doubted(problem, found, doubt, self.options.solver.following())
         return self._result(problem, found, believed, begin, doubt)
@@ -838,7 +825,7 @@ class Registrar:
             noise=found.posterior.scales.noise,
             force_scale=found.posterior.scales.force,
             rms_distance=trial.match.rms,
-            outliers=float(np.mean(found.weights < _NO_PULL)),
+            outliers=float(np.mean(found.weights < 0.05)),
             informed=found.posterior.informed,
             points=len(problem.cloud),
             outcome=found.outcome,
@@ -952,13 +939,6 @@ def expected_force(body: Body, young_modulus: float) -> float:
     """Nodal force to begin with, newtons: 1 % of Young's modulus (Pa) over the square of a typical edge."""
     edge = float(np.median(edge_lengths(body.points, body.cells)))
     return 0.01 * young_modulus * edge**2
-
-
-def _onward(solver: GaussNewton | LBFGS, found: Found) -> GaussNewton | LBFGS:
-    """The solver from where it has been: with its last loss alone, where that has hardly left out a point."""
-    last = solver.last()
-    is_there = found.local.loss == last.losses[0] and float(np.mean(found.weights < _NO_PULL)) <= _HARDLY
-    return last if is_there else solver
 
 
 def badness(result: Registration) -> tuple[int, float]:
