@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import numpy as np
@@ -35,8 +36,9 @@ def run_demo(
         ConfigError: the port is taken.
     """
     home, states = find_twin(PHANTOM), TrueStates.read(PHANTOM)
-    with serving(port, "softtwin demo") as server:
-        session = Session(server, home, is_simulated=True)
+    with ExitStack() as stack:  # however early Ctrl-C comes: a thread at work when Python ends takes the process down
+        server = stack.enter_context(serving(port, "softtwin demo"))
+        session = stack.enter_context(closing(Session(server, home, is_simulated=True)))
 
         def show() -> None:
             say(f"softtwin demo: {address(server)}   (Ctrl-C ends it). {NOTICE}")

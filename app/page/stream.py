@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -130,8 +131,10 @@ def _show(
 ) -> None:
     chosen = {name: value for name, value in options.items() if name != "model"}
     engine = str(options.get("model") or home.config.registration.model)
-    with serving(port, "softtwin live") as server:
+    with ExitStack() as stack:  # however early Ctrl-C comes: a thread at work when Python ends takes the process down
+        server = stack.enter_context(serving(port, "softtwin live"))
         session = Session(server, home, options=chosen, camera=camera, engine=engine)
+        stack.enter_context(closing(session))
 
         def show() -> None:
             say(f"softtwin live: {address(server)}   (Ctrl-C ends it). {NOTICE}")

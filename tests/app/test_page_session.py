@@ -105,6 +105,8 @@ def test_ctrl_c_the_moment_the_address_is_said_closes_the_page(opened: Any) -> N
 
     opened(say)
     assert "http://" in said[0] and said[1:] == ["\nthe page is closed."]
+    at_work = {thread.name for thread in threading.enumerate()}
+    assert not at_work & {"softtwin hand", "softtwin brush"}  # Python would end in the middle of what they do
 
 
 def test_the_organ_that_is_shown_is_the_one_that_was_registered(told: list[Figures]) -> None:
