@@ -59,6 +59,21 @@ def until(page: Page, claim: Any) -> None:
     assert claim()
 
 
+def pull(page: Page, heard: live_page.Heard) -> None:
+    """Take hold of the organ and pull a little; once more where it was not drawn yet under the mouse."""
+    before = len(heard.drags)
+    for _ in range(60):
+        x, y = take_hold(page)
+        for step in range(1, 9):
+            page.mouse.move(x + 3 * step, y - 2 * step)
+            page.wait_for_timeout(80)
+        if len(heard.drags) > before:
+            return
+        page.mouse.up()
+        page.wait_for_timeout(1000)
+    raise AssertionError("the organ could not be taken hold of")
+
+
 def picture(page: Page) -> Any:
     """The canvas with whatever lies over it, (h, w, 3), of 0 to 1."""
     from matplotlib.image import imread
@@ -106,10 +121,7 @@ def test_the_page_has_no_button_for_a_public_address(page: Any) -> None:
 def test_the_organ_follows_a_pull_and_comes_back(page: Any) -> None:
     text = page.page.locator("body")
     before = len(page.heard.drags)
-    x, y = take_hold(page.page)
-    for step in range(1, 9):
-        page.page.mouse.move(x + 3 * step, y - 2 * step)
-        page.page.wait_for_timeout(80)
+    pull(page.page, page.heard)
     expect(text).to_contain_text("forward prediction of a pull", timeout=WAIT)
     expect(text).to_contain_text("largest error (90 % of loads)", timeout=WAIT)
     until(page.page, lambda: len(page.heard.drags) > before + 3 and len(page.heard.answers()) > 3)
@@ -119,11 +131,8 @@ def test_the_organ_follows_a_pull_and_comes_back(page: Any) -> None:
 
 
 def test_a_browser_that_goes_away_in_the_middle_of_a_drag_leaves_the_page_sound(shown: Any, page: Any) -> None:
-    other, _ = opened(shown.browser, shown.address)
-    x, y = take_hold(other)
-    for step in range(1, 6):
-        other.mouse.move(x + 4 * step, y)
-        other.wait_for_timeout(80)
+    other, heard = opened(shown.browser, shown.address)
+    pull(other, heard)
     expect(page.page.locator("body")).to_contain_text("forward prediction of a pull", timeout=WAIT)
     other.close()
     expect(page.page.locator("body")).to_contain_text("true error", timeout=WAIT)
