@@ -134,7 +134,8 @@ def read_truth(path: Path, frames: int, body: Body, coordinates: Coordinates) ->
     turned = coordinates.directions(positions)
     off = np.linalg.norm(turned[0, body.fixed] - body.points[body.fixed], axis=1)
     away = float(off.mean()) if len(off) else 0.0
-    if away > _FAR_OFF * body.size:
+    is_spot = len(off) > 1 and float(np.ptp(turned[0, body.fixed], axis=0).max()) == 0.0  # displacements: all zero
+    if away > _FAR_OFF * body.size or is_spot:
         raise ConfigError(
             f"--truth: expected positions in metres in which the fixed nodes are where the body has them, got them "
             f"{away:.3g} m away on average in {path}; are these displacements, or in another unit or on other axes?"

@@ -121,6 +121,13 @@ def test_displacements_are_no_truth(tmp_path: Path, plain_twin: Twin) -> None:
     np.save(tmp_path / "t.npy", 0.01 * np.ones((1, 176, 3)))
     with pytest.raises(ConfigError, match=r"--truth: expected positions .* are these displacements"):
         read_truth(tmp_path / "t.npy", 1, body, METRES)
+    still = 0.01 * np.ones((1, 176, 3))
+    still[:, body.fixed] = 0.0
+    np.save(tmp_path / "t.npy", still)
+    for centred in (plain_twin.body.points - plain_twin.body.points[body.fixed].mean(axis=0), plain_twin.body.points):
+        near = Body(centred, plain_twin.body.cells, plain_twin.body.node_sets)  # what is held lies about the origin
+        with pytest.raises(ConfigError, match="are these displacements"):
+            read_truth(tmp_path / "t.npy", 1, near, METRES)
 
 
 def test_a_matrix_is_in_the_clouds_unit_and_on_their_axes(tmp_path: Path, rng) -> None:
