@@ -829,7 +829,7 @@ class Registrar:
             informed=found.posterior.informed,
             points=len(problem.cloud),
             outcome=found.outcome,
-            judgement=judge(problem, found, state, self.expectations),
+            judgement=judge(problem, found, state, self.expectations, doubt),
             evaluations=found.evaluations,
             seconds=time.perf_counter() - begin,
             trace=found.trace,

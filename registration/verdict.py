@@ -70,6 +70,7 @@ class Expectations:
         pose: largest move of the pose in deviations of its prior.
         condition: the same of stiffness and other unknowns beside the forces.
         gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
+        doubt: how often as large as it was seen to be what the model gets wrong may be taken.
         told: least part of the variance of such an unknown, and of every combination of them, that a cloud must take
             away where all forces are known.
     """
@@ -82,6 +83,7 @@ class Expectations:
     informed: float = 2.0
     pose: float = 3.0
     condition: float = 3.0
+    doubt: float = 2.0
     told: float = 0.5
     gradient: float = np.inf
 
@@ -105,7 +107,7 @@ class Expectations:
 _Finding = tuple[Verdict, str]
 
 
-def judge(problem: Problem, found: Found, state: State, expected: Expectations) -> Judgement:
+def judge(problem: Problem, found: Found, state: State, expected: Expectations, doubt: float = 1.0) -> Judgement:
     """The verdict on a solver's result.
 
     Args:
@@ -113,12 +115,14 @@ def judge(problem: Problem, found: Found, state: State, expected: Expectations) 
         found: where the solver ended.
         state: the body's state there.
         expected: what a usable result looks like.
+        doubt: how large the model's error was found, in units of its samples'.
     """
     findings = [
         *_of_the_search(found),
         *_of_the_cloud(problem, found, expected),
         *_of_the_fit(problem, found, expected),
         *_of_the_state(problem, state, expected),
+        *_of_the_error(doubt, expected),
         *_of_the_pose(problem, found, expected),
         *_of_the_conditions(problem, found, expected),
         *_of_the_marks(problem, found),
@@ -271,6 +275,16 @@ def _of_the_state(problem: Problem, state: State, expected: Expectations) -> lis
     if pivots:
         findings.append((Verdict.DOUBTFUL, f"the state is unstable: {pivots} negative pivots of its tangent"))
     return findings
+
+
+def _of_the_error(doubt: float, expected: Expectations) -> list[_Finding]:
+    """What no state explains goes into what the model gets wrong: more of that than was seen is none of it."""
+    if doubt <= expected.doubt:
+        return []
+    return [
+        (Verdict.DOUBTFUL, f"the cloud asks for {doubt:.1f} times what the model was seen to get wrong: some of it "
+                           "shows no state of this organ, or the organ is not as it was taken for")
+    ]  # fmt: skip
 
 
 def _of_the_pose(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:

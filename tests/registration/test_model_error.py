@@ -15,6 +15,7 @@ from softtwin.registration.problem import Problem, Trial
 from softtwin.registration.registrar import Registrar, options_for
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import ModelError, PosePrior, nodal_forces
+from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
 
@@ -93,6 +94,14 @@ def test_doubt_of_the_net_force_knows_of_the_models_error(body: Body) -> None:
     assert 0.5 < np.mean(scores) < 1.5
     assert 1.5 * np.mean(scores) < np.mean(blind) < 4.0 * np.mean(scores)
     assert np.mean(shared) > 0.9
+
+
+@pytest.mark.parametrize(("size", "verdict"), [(1.0, Verdict.ACCEPTED), (4.0, Verdict.DOUBTFUL)])
+def test_more_than_the_model_was_seen_to_get_wrong_is_doubtful(body: Body, rng, size: float, verdict: Verdict) -> None:
+    cloud = cloud_on(body, true_displacement(body, np.array([size, -size])), 400, rng, 5e-4)
+    result = registrar(body).register(cloud)
+    assert result.judgement.verdict is verdict, (result.doubt, result.judgement.reasons)
+    assert any("seen to get wrong" in each for each in result.judgement.reasons) == (verdict is Verdict.DOUBTFUL)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
