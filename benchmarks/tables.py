@@ -346,6 +346,27 @@ def liver_engines() -> None:
         )
 
 
+def foreign_patches() -> None:
+    """Clouds of which a part is not where the organ is."""
+    found = recorded("foreign_patches")
+    if not found:
+        return
+    groups = ("accepted", "told by the model's error")
+    head("foreign_patches", "frames; failed", "all: TRE mm (most)", *(f"{g}: TRE mm (most)" for g in groups), "held %")
+    for key, f in found.items():
+        cells = [
+            f"{f[g]['frames']}: {f[g]['tre_mm']:.2f} ({f[g]['tre_most_mm']:.2f})" if g in f else "-" for g in groups
+        ]
+        held = f"{100 * f['accepted']['held']:.0f}" if "accepted" in f else "-"
+        row(
+            key,
+            f"{f['frames']}; {f['failed']}",
+            f"{f['all']['tre_mm']:.2f} ({f['all']['tre_most_mm']:.2f})",
+            *cells,
+            held,
+        )
+
+
 def other_mesh() -> None:
     """What another mesh of the real liver can do at all."""
     found = recorded("other_mesh")
@@ -624,6 +645,7 @@ def print_all() -> None:
     beam_registration("beam_registration")
     beam_registration("beam_registration_tried")
     liver_engines()
+    foreign_patches()
     other_mesh()
     pose_noise()
     calibration()
