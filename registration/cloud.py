@@ -66,6 +66,15 @@ class Cloud:
         kept = thinned(self.points, most)
         return Cloud(self.points[kept], None if self.normals is None else self.normals[kept])
 
+    def distinct(self) -> Cloud:
+        """Each place once: a point that is there again tells nothing more. The same where none is."""
+        order = np.lexsort(self.points.T)
+        is_again = (np.diff(self.points[order], axis=0) == 0.0).all(axis=1)
+        if not is_again.any():
+            return self
+        kept = np.setdiff1d(np.arange(len(self)), order[1:][is_again])
+        return Cloud(self.points[kept], None if self.normals is None else self.normals[kept])
+
     @cached_property
     def across(self) -> Floats | None:
         """Two unit vectors across each normal and each other, (p, 2, 3); zeros where none was measured."""

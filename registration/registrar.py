@@ -785,7 +785,7 @@ class Registrar:
     def _checked(self, cloud: ArrayLike) -> Cloud:
         given = Cloud.of(cloud)
         if given.is_finite:
-            given = given.thinned(self.options.most_points)
+            given = given.thinned(self.options.most_points).distinct()
             if self.pose is not None:
                 check_cloud(self.pose.mean.inverse().apply(given.points), self.model.body)
                 return given

@@ -153,6 +153,7 @@ def test_a_large_cloud_is_thinned_with_its_normals(body: Body) -> None:
     assert few.shape == (50, 6)
     assert all((row == seen).all(axis=1).any() for row in few)
     assert Cloud.of(seen[:, :3]).across is None
+    np.testing.assert_array_equal(Cloud.of(np.repeat(few, 3, axis=0)).distinct().array(), few)
 
 
 def test_what_is_no_cloud_with_normals_is_refused(body: Body) -> None:

@@ -202,6 +202,16 @@ def test_large_clouds_are_thinned_and_answer_alike(body: Body, rng) -> None:
     assert np.median(missed) < 5e-4  # of many: one cloud proves nothing
 
 
+def test_points_that_are_there_again_tell_nothing_more(body: Body, rng) -> None:
+    truth = Cantilever(body).solve(tip_forces(body, NET)).displacement
+    cloud = cloud_on(body, truth, 150, rng, 1e-3)
+    made = registrar(body)
+    once, often = made.register(cloud), made.register(np.concatenate([cloud, cloud[::-1], cloud]))
+    assert (once.points, often.points) == (150, 150)
+    np.testing.assert_array_equal(often.displacement, once.displacement)
+    np.testing.assert_array_equal(often.net_force_covariance, once.net_force_covariance)
+
+
 @pytest.mark.parametrize("name", ["settled", "enough", "handed_on", "max_step", "least_step"])
 def test_options_that_cannot_be_are_named(name: str) -> None:
     with pytest.raises(ValueError, match=rf"GaussNewton\.{name}: expected a positive number"):
