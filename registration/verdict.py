@@ -71,6 +71,7 @@ class Expectations:
         condition: the same of stiffness and other unknowns beside the forces.
         gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
         doubt: how often as large as it was seen to be what the model gets wrong may be taken.
+        correction: however large beside what was seen, so little of it harms nobody: of an observed node, metres.
         told: least part of the variance of such an unknown, and of every combination of them, that a cloud must take
             away where all forces are known.
     """
@@ -84,6 +85,7 @@ class Expectations:
     pose: float = 3.0
     condition: float = 3.0
     doubt: float = 2.0
+    correction: float = 0.0
     told: float = 0.5
     gradient: float = np.inf
 
@@ -100,6 +102,7 @@ class Expectations:
             noise=max(0.025 * size, 3.0 * noise.median),
             systematic=max(0.005 * size, noise.median),
             movement=0.35 * size,
+            correction=0.0005 * size,
             gradient=_SMALL if getattr(model, "is_linear", False) else np.inf,
         )
 
@@ -122,7 +125,7 @@ def judge(problem: Problem, found: Found, state: State, expected: Expectations, 
         *_of_the_cloud(problem, found, expected),
         *_of_the_fit(problem, found, expected),
         *_of_the_state(problem, state, expected),
-        *_of_the_error(doubt, expected),
+        *_of_the_error(problem, found, expected, doubt),
         *_of_the_pose(problem, found, expected),
         *_of_the_conditions(problem, found, expected),
         *_of_the_marks(problem, found),
@@ -277,13 +280,18 @@ def _of_the_state(problem: Problem, state: State, expected: Expectations) -> lis
     return findings
 
 
-def _of_the_error(doubt: float, expected: Expectations) -> list[_Finding]:
+def _of_the_error(problem: Problem, found: Found, expected: Expectations, doubt: float) -> list[_Finding]:
     """What no state explains goes into what the model gets wrong: more of that than was seen is none of it."""
     if doubt <= expected.doubt:
         return []
+    correction = problem.correction(found.trial)[problem.observed.nodes]
+    size = float(np.sqrt((correction**2).sum(axis=1).mean()))
+    if size <= expected.correction:
+        return []
     return [
-        (Verdict.DOUBTFUL, f"the cloud asks for {doubt:.1f} times what the model was seen to get wrong: some of it "
-                           "shows no state of this organ, or the organ is not as it was taken for")
+        (Verdict.DOUBTFUL, f"the cloud asks for {doubt:.1f} times what the model was seen to get wrong, "
+                           f"{1e3 * size:.1f} mm: some of it shows no state of this organ, or the organ is not as it "
+                           "was taken for")
     ]  # fmt: skip
 
 
