@@ -15,7 +15,7 @@ from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.embedding import outer
 from softtwin.meshes.export import SURFACE_FORMATS, Coordinates, write_points, write_series, write_surface
 from softtwin.meshes.files import write_deformed
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 
 from .bundles import Track, write_scene, write_sequence
 from .config import ConfigError

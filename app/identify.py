@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from softtwin.meshes.files import Unit
 from softtwin.registration.conditions import Estimate
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 
 from .export import WRITTEN, Exporter
 from .record import Recorder, describe, describe_estimate

@@ -17,7 +17,7 @@ from softtwin.meshes.body import Surface
 from softtwin.meshes.embedding import Embedding
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import Axes, FileError, discard
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Verdict
 
 from .twin import Twin

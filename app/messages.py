@@ -24,7 +24,7 @@ from pyigtl.messages import CRC64, MessageBase, PolyDataMessage, StringMessage, 
 
 from softtwin.meshes.body import Surface
 from softtwin.meshes.export import Coordinates
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 
 from .record import NOTICE, finite
 from .twin import Twin

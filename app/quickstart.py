@@ -14,7 +14,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import target_points
 from softtwin.meshes.files import read_body
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 
 from .chain import make_twin, prepare
 from .config import Config

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.metrics import target_errors
 from softtwin.registration.conditions import WITHIN_90
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Verdict
 
 from .config import axes_unknown

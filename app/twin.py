@@ -30,18 +30,12 @@ from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.marks import Marks
+from softtwin.registration.options import NOISE, RegistrationOptions, expected_force, options_for
 from softtwin.registration.penalties import PENALTIES
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import (
-    NOISE,
-    Registrar,
-    Registration,
-    RegistrationOptions,
-    expected_force,
-    options_for,
-    prepare,
-)
+from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.result import Registration
 from softtwin.registration.rigid import align
 from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Judgement, Verdict

@@ -40,8 +40,9 @@ from softtwin.reference.data.samplers import draw_load
 from softtwin.reference.solve.problem import Problem
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel
+from softtwin.registration.options import expected_force, options_for
 from softtwin.registration.problem import Problem as Search
-from softtwin.registration.registrar import expected_force, options_for, prepare
+from softtwin.registration.registrar import prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain

@@ -40,7 +40,8 @@ from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.solve.problem import Problem
 from softtwin.registration.evidence import Scale
-from softtwin.registration.registrar import options_for, prepare
+from softtwin.registration.options import options_for
+from softtwin.registration.registrar import prepare
 from softtwin.registration.unknowns import nodal_forces
 from softtwin.registration.verdict import Verdict
 from softtwin.surrogate.model import Surrogate

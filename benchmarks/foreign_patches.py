@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.outcome import NotConverged
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
 Moved = Callable[[Floats, Body, np.random.Generator], Floats]

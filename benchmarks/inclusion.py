@@ -32,7 +32,9 @@ from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 from softtwin.registration.conditions import WITHIN_90, Conditions, Estimate, PoissonRatio, Stiffness
-from softtwin.registration.registrar import Registration, expected_force, options_for, prepare
+from softtwin.registration.options import expected_force, options_for
+from softtwin.registration.registrar import prepare
+from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -40,8 +40,9 @@ from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.loss import Square
+from softtwin.registration.options import NOISE, expected_force
 from softtwin.registration.problem import Problem as Search
-from softtwin.registration.registrar import NOISE, expected_force, prepare
+from softtwin.registration.registrar import prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import known_forces, nodal_forces
 from softtwin.registration.verdict import Verdict

@@ -46,7 +46,9 @@ from softtwin.reference.solve.problem import NewtonOptions, Problem
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.hybrid import HybridRegistrar
-from softtwin.registration.registrar import NOISE, Registrar, Registration, expected_force, options_for, prepare
+from softtwin.registration.options import NOISE, expected_force, options_for
+from softtwin.registration.registrar import Registrar, prepare
+from softtwin.registration.result import Registration
 from softtwin.surrogate.discrepancy import beside
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.twin import load as load_twin

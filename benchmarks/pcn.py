@@ -34,7 +34,7 @@ from softtwin.meshes.clouds import partial_view
 from softtwin.reference.data.dataset import DataSet
 from softtwin.registration.loss import Loss, Tukey
 from softtwin.registration.problem import Problem, Trial
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
 NAME = "pcn"

@@ -23,7 +23,7 @@ from softtwin.app.twin import Twin
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import target_points
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
 SIZES = (1_000, 10_000, 100_000, 1_000_000)

@@ -19,13 +19,8 @@ from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 from softtwin.registration.forward import ForwardModel
-from softtwin.registration.registrar import (
-    RegistrationOptions,
-    expected_force,
-    options_for,
-    prepare,
-    register_sequence,
-)
+from softtwin.registration.options import RegistrationOptions, expected_force, options_for
+from softtwin.registration.registrar import prepare, register_sequence
 
 
 def run(

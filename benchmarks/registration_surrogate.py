@@ -21,7 +21,7 @@ from softtwin.app.launch import generate_in_parallel
 from softtwin.app.stages.learn import train_stage, validate_stage
 from softtwin.app.workspace import Workspace
 from softtwin.meshes.files import write_body
-from softtwin.registration.registrar import options_for
+from softtwin.registration.options import options_for
 
 RUNS = Path(__file__).parent / "runs"
 

@@ -28,14 +28,10 @@ from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.shapes import liver_phantom
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.forward import ForwardModel
+from softtwin.registration.options import expected_force, options_for
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import (
-    Registrar,
-    Registration,
-    expected_force,
-    options_for,
-    prepare,
-)
+from softtwin.registration.registrar import Registrar, prepare
+from softtwin.registration.result import Registration
 from softtwin.registration.unknowns import PosePrior
 
 Floats = NDArray[np.float64]

@@ -13,7 +13,8 @@ from softtwin.meshes.body import Body
 from softtwin.reference.data.inputs import Change, Inputs
 
 from .conditions import Conditions, Estimate, check_deviation, estimate
-from .registrar import Registrar, Registration
+from .registrar import Registrar
+from .result import Registration
 from .unknowns import known_forces
 from .verdict import Judgement, Verdict
 

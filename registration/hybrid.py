@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from softtwin.reference.data.outcome import NotConverged
 
 from .marks import Marks
-from .registrar import Registrar, Registration, badness
+from .registrar import Registrar
 from .residuals import SurfaceDistance
+from .result import Registration, badness
 from .verdict import Verdict
 
 

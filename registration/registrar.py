@@ -6,42 +6,39 @@ import copy
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, reduce
+from dataclasses import replace
+from functools import cache, reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
 
-from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import check_cloud
-from softtwin.meshes.metrics import edge_lengths
 from softtwin.reference.data.outcome import NotConverged
 
 from .anchored import Anchored
 from .cloud import Cloud
-from .conditions import Conditions, Estimate
+from .conditions import Conditions
 from .correlated import CorrelatedNoise
 from .evidence import Scale
-from .forward import ForwardModel, ReducedModel, State, reduce_model
-from .gauss_newton import Found, GaussNewton, LocalModel, Step
+from .forward import ForwardModel, ReducedModel, reduce_model
+from .gauss_newton import Found, GaussNewton
 from .lbfgs import LBFGS
 from .loss import robust_deviation
 from .marks import Marks
+from .options import NOISE, RegistrationOptions
 from .outcome import Outcome
 from .pose import Pose
-from .posterior import Posterior
-from .problem import NORMAL_DEVIATION, Problem, Trial
-from .residuals import Distance, SurfaceDistance
-from .uncertainty import Uncertainty, uncertainty, unseen_response
-from .unknowns import Forces, Informed, ModelError, PosePrior, contact, known_forces, nodal_forces, told, windowed
+from .prepared import Prepared
+from .problem import Problem, Trial
+from .residuals import SurfaceDistance
+from .result import Registration, badness
+from .unknowns import Forces, Informed, ModelError, PosePrior, contact, known_forces, nodal_forces, windowed
 from .verdict import Expectations, Judgement, Verdict, judge, shared
 
 Floats = NDArray[np.float64]
 # Of the logarithm of a nodal force: with more, forces explain noise and the model's error. Without either, a pull at a
 # few nodes makes it many times what was expected.
 _SPREAD = 0.5
-_SPREAD_ANYWHERE = 0.7  # where a cloud tells the size of forces of which most are none
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
@@ -59,257 +56,8 @@ _GONE = 1.0  # times the least noise: correlated noise that small is not looked 
 _BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
 _LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
-_MANY = 10_000  # points: of no cloud that is left after thinning are there more
-_CLEAR, _LOUD = 2.0, 1.5  # times the least noise, times the model's error
-_CLOSE = 0.01  # reach of a surrogate's forces whose zone is unknown: with more, their doubt is larger than their error
 _LEADING = 6  # directions of force that a cold start begins with
 _ANCHORS = 3  # exact states from which a fast model goes on
-NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
-
-
-@dataclass(frozen=True)
-class Gathering:
-    """How a cold start finds where forces act: they are expected again where a round before has found some.
-
-    Args:
-        rounds: how often.
-        reach: forces within this part of the body's size are gathered together.
-        informed: which directions are kept of gathered forces.
-        points: so many of the cloud are enough, but for the last round.
-    """
-
-    rounds: int = 2
-    reach: float = 0.035
-    informed: Informed = field(default_factory=Informed)
-    points: int = 300
-
-    def __post_init__(self) -> None:
-        if self.points < 1:
-            raise ValueError(f"Gathering.points: expected at least 1, got {self.points}.")
-
-
-@dataclass(frozen=True)
-class Belief:
-    """When the size of the forces is left to the cloud, whatever was expected of it.
-
-    Args:
-        clear: in clouds of less noise, metres.
-        loud: and in clouds of more, beside which what the model gets wrong is small, metres.
-        spread: of the logarithm of the size then.
-    """
-
-    clear: float = 0.0
-    loud: float = np.inf
-    spread: float = 1.0
-
-
-@dataclass(frozen=True)
-class RegistrationOptions:
-    """How a cloud is trusted and by what it is registered.
-
-    Args:
-        noise: what is believed of the standard deviation of a point's distance, metres; found from the cloud.
-        solver: how the objective is minimised.
-        most_points: larger clouds are thinned to so many points.
-        gathering: how a cold start finds where forces act.
-        belief: when the size of the forces is left to the cloud.
-        distance: of points to the surface, or to the planes of its triangles; see `SurfaceDistance`.
-        normal_deviation: standard deviation of a measured normal across itself, radians.
-        correlated: look for noise that neighbouring points share; see `correlated.find_correlated`.
-    """
-
-    noise: Scale = NOISE
-    solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
-    most_points: int = 1000
-    gathering: Gathering = field(default_factory=Gathering)
-    belief: Belief = field(default_factory=Belief)
-    distance: Distance = "surface"
-    normal_deviation: float = NORMAL_DEVIATION
-    correlated: bool = True
-
-    def __post_init__(self) -> None:
-        if self.distance not in ("surface", "plane"):
-            raise ValueError(f"RegistrationOptions.distance: expected surface or plane, got {self.distance!r}.")
-        if not 0.0 < self.normal_deviation < np.inf:
-            raise ValueError(
-                f"RegistrationOptions.normal_deviation: expected a positive angle, got {self.normal_deviation}."
-            )
-        if self.most_points < 1:
-            raise ValueError(f"RegistrationOptions.most_points: expected at least 1, got {self.most_points}.")
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """Forces and the reduced model between them and the observed side.
-
-    Args:
-        forces: the unknown forces.
-        model: from their coefficients to the observed nodes.
-    """
-
-    forces: Forces
-    model: ReducedModel
-
-    @classmethod
-    def of(
-        cls, model: ForwardModel, observed: SurfaceDistance, forces: Forces, conditions: Conditions | None = None
-    ) -> Prepared:
-        """What can be multiplied before a cloud comes."""
-        return cls(forces, reduce_model(model, observed.nodes, forces.basis, conditions))
-
-    def informed(self, observed: SurfaceDistance, rule: Informed) -> Prepared:
-        """The directions that a cloud can tell: see `unknowns.told`."""
-        kept = told(self.model, observed, rule)
-        return Prepared(self.forces.combined(kept), self.model.combined(kept))
-
-    def leading(self, count: int) -> Prepared:
-        """The first directions alone."""
-        return Prepared(self.forces.leading(count), self.model.combined(np.eye(self.forces.size)[:, :count]))
-
-    @cached_property
-    def unseen(self) -> Floats:
-        """Displacements by the directions of force that were left out, for unit scale, (3n, r)."""
-        return unseen_response(self.model, self.forces)
-
-    def believing(self, spread: float) -> Prepared:
-        """The same with another spread of the logarithm of the forces' size."""
-        scale = replace(self.forces.scale, spread=spread)
-        return replace(self, forces=replace(self.forces, scale=scale))
-
-
-@dataclass(frozen=True, eq=False)
-class Registration:
-    """One registered cloud.
-
-    Args:
-        prepared: the forces' basis that its coefficients belong to.
-        trial: where the solver ended; the next frame starts there.
-        forces: nodal forces, (n, 3), newtons.
-        state: the body's state as the model has it, with its derivatives.
-        correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres; with
-            it what a pose that was said to be known is off by.
-        doubt: how large the model's error was found, in units of its samples'; 1 where it is not known in patterns.
-        alike: so many points tell what one would that errs by itself; 1 where each does.
-        pose: from the body's coordinates to the cloud's.
-        askew: what a pose that was said to be known is off by: a motion in the body's coordinates.
-        net_force: (3,), newtons.
-        net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
-        noise: standard deviation of a point's distance that was found, metres.
-        force_scale: standard deviation of the force coefficients that was found, newtons.
-        rms_distance: of the cloud to the registered surface, metres.
-        outliers: share of the points that pulled nothing.
-        informed: directions of force and pose that the cloud told.
-        points: points that were used, after thinning.
-        outcome: how the solver ended.
-        judgement: whether the result can be used, and why not.
-        evaluations: forward solves.
-        seconds: wall time.
-        trace: one entry an iteration.
-        problem: what was solved, for the cloud and the model's error as they were taken in the end.
-        posterior: of the coefficients.
-        local: the objective's model there; None for a result that was put together otherwise.
-        looked_for: so many frames on noise that neighbours share was looked for and not found; 0 where it was not.
-        draft: what a faster model had found, where this one went on from there.
-    """
-
-    prepared: Prepared
-    trial: Trial
-    forces: Floats
-    state: State
-    correction: Floats
-    doubt: float
-    alike: float
-    pose: Pose
-    askew: Pose
-    net_force: Floats
-    net_force_covariance: Floats
-    noise: float
-    force_scale: float
-    rms_distance: float
-    outliers: float
-    informed: float
-    points: int
-    outcome: Outcome
-    judgement: Judgement
-    evaluations: int
-    seconds: float
-    trace: tuple[Step, ...]
-    problem: Problem
-    posterior: Posterior
-    local: LocalModel | None = None
-    looked_for: int = 0
-    draft: Registration | None = None
-
-    @property
-    def coefficients(self) -> Floats:
-        """Of forces, pose, conditions and model error, (k,)."""
-        return self.trial.coefficients
-
-    @cached_property
-    def scatter(self) -> float:
-        """Standard deviation of a point's distance with what neighbours share of its noise, metres."""
-        return float(np.sqrt(self.noise**2 + np.mean(self.problem.shared_noise(self.trial) ** 2)))
-
-    @property
-    def unknown_forces(self) -> Floats:
-        """Nodal forces of the basis, (n, 3), without those of conditions: newtons on a body as stiff as expected."""
-        return self.prepared.forces.forces(self.coefficients[self.problem.force_part])
-
-    @property
-    def displacement(self) -> Floats:
-        """Of all nodes, (n, 3), metres, in the body's coordinates: the state's with the correction."""
-        return self.state.displacement + self.correction
-
-    @property
-    def net_force_deviation(self) -> Floats:
-        """Standard deviation of each component of the net force, (3,), newtons."""
-        return np.sqrt(np.diag(self.net_force_covariance))
-
-    @cached_property
-    def estimates(self) -> tuple[Estimate, ...]:
-        """What is known of stiffness and other unknowns beside the forces; none where there are none."""
-        conditions, part = self.problem.conditions, self.problem.condition_part
-        if conditions is None:
-            return ()
-        return conditions.estimates(self.coefficients[part], self.posterior.covariance[part, part])
-
-    @cached_property
-    def chance_of_pose(self) -> float:
-        """Chance that a pose which is just as expected seems so far from it; 1 where none is unknown.
-
-        The distance between the two in the posterior's deviations, against chi-square's law.
-        """
-        part = self.problem.pose_part
-        off, covariance = self.coefficients[part], self.posterior.covariance[part, part]
-        return float(chi2.sf(off @ np.linalg.solve(covariance, off), len(off))) if len(off) else 1.0
-
-    @cached_property
-    def force_over_modulus(self) -> tuple[Floats, Floats] | None:
-        """Net force over Young's modulus, (3,), square metres, and its standard deviation, (3,).
-
-        It is all that a state under nodal forces and fixed supports depends on. None where the modulus is no unknown.
-        """
-        conditions, problem = self.problem.conditions, self.problem
-        unknown = None if conditions is None else conditions.modulus
-        if conditions is None or unknown is None:
-            return None
-        place, deviation = problem.condition_part.start + unknown[0], unknown[1]
-        modulus = float(
-            np.mean(conditions.inputs(self.coefficients[problem.condition_part]).parameters["young_modulus"])
-        )
-        slopes = problem.net_forces(self.trial) / modulus
-        slopes[:, place] -= deviation * self.net_force / modulus
-        covariance = self.posterior.net_force_covariance(slopes, problem.forces.left_out / modulus**2)
-        return self.net_force / modulus, np.sqrt(np.diag(covariance))
-
-    @cached_property
-    def uncertainty(self) -> Uncertainty:
-        """How far each point of the body may be from where it was found; computed when it is first asked for.
-
-        It holds for what the problem reckons with: noise, forces like those expected, the model's error where its
-        patterns are known. Wrong stiffness, attachment or shape of the body are not among them.
-        """
-        return uncertainty(self.problem, self.trial, self.posterior, self.prepared.unseen)
 
 
 _Again = Callable[["Registrar", Registration], Registration]  # what a registrar makes of a cloud, from a result for it
@@ -910,40 +658,6 @@ def prepare(
         modulus_deviation=modulus_deviation,
         anywhere=None if elsewhere is None or nodes is None else anywhere,
     )
-
-
-def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> RegistrationOptions:
-    """Options that suit a model.
-
-    Within a zone forces are not gathered: what a cloud was used to believe it would be used to find once more, and
-    margins would be too narrow. An exact model is only as good as the end of the descent. What a surrogate gets wrong
-    could be taken for large forces: it is left to clouds of more noise than that to tell their size. But where the
-    pose is unknown, forces that are expected small would be taken for a turn of the organ, which is worse.
-
-    Args:
-        model: forward model.
-        has_zone: the nodes that may carry force are those that a tool can touch.
-        has_pose: the pose is unknown.
-    """
-    clear, loud = _CLEAR * NOISE.least, _LOUD * model.error
-    if model.error == 0.0:
-        gathering = Gathering(rounds=0 if has_zone else Gathering.rounds, points=_MANY)
-        return RegistrationOptions(gathering=gathering, belief=Belief(clear))
-    if has_zone:
-        belief = Belief(clear if has_pose else 0.0, loud)
-        return RegistrationOptions(gathering=Gathering(rounds=0, points=_MANY), belief=belief)
-    return RegistrationOptions(gathering=Gathering(reach=_CLOSE), belief=Belief(loud=loud, spread=_SPREAD_ANYWHERE))
-
-
-def expected_force(body: Body, young_modulus: float) -> float:
-    """Nodal force to begin with, newtons: 1 % of Young's modulus (Pa) over the square of a typical edge."""
-    edge = float(np.median(edge_lengths(body.points, body.cells)))
-    return 0.01 * young_modulus * edge**2
-
-
-def badness(result: Registration) -> tuple[int, float]:
-    """By which results for one cloud are ordered, the best first."""
-    return list(Verdict).index(result.judgement.verdict), result.scatter
 
 
 def _out_of_time(found: Registration, told: tuple[float, float]) -> Registration:

@@ -15,7 +15,7 @@ import viser
 from numpy.typing import NDArray
 
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 
 from ..record import askew_of
 from ..register import registered

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from softtwin.meshes.body import Body
 from softtwin.meshes.closest import distances
 from softtwin.meshes.embedding import outer
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 
 from ..twin import Twin
 

@@ -12,7 +12,7 @@ from softtwin.app.config import Config, ConfigError
 from softtwin.app.export import FORMATS, Exporter, file_names
 from softtwin.app.twin import Twin
 from softtwin.meshes.files import read_surface
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 
 from .conftest import pulled, seen_cloud
 

@@ -20,7 +20,7 @@ from softtwin.meshes.files import read_body
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.solve.problem import Problem
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Verdict
 
 pytestmark = pytest.mark.fenicsx

@@ -30,7 +30,7 @@ from softtwin.reference.data.dataset import LinearResponse, create, write_block
 from softtwin.registration.conditions import Estimate
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 from softtwin.registration.uncertainty import Uncertainty
 from softtwin.registration.verdict import Judgement, Verdict
 

@@ -27,7 +27,7 @@ from softtwin.meshes.displacement import read_displacement
 from softtwin.meshes.export import SURFACE_FORMATS, Coordinates
 from softtwin.meshes.files import FileError, read_surface, read_volume
 from softtwin.registration.pose import read_landmarks
-from softtwin.registration.registrar import Registration
+from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Judgement, Verdict
 
 from .conftest import pulled, seen_cloud

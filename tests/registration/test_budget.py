@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from softtwin.meshes.body import Body
 from softtwin.registration.evidence import Scale
 from softtwin.registration.lbfgs import LBFGS
+from softtwin.registration.options import Gathering, RegistrationOptions
 from softtwin.registration.outcome import Outcome
-from softtwin.registration.registrar import Gathering, Registrar, RegistrationOptions
+from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import nodal_forces
 from softtwin.registration.verdict import Verdict

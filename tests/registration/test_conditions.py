@@ -15,8 +15,9 @@ from softtwin.reference.data.loading import Loading
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.registration.conditions import Conditions, Moved, PoissonRatio, Stiffness
 from softtwin.registration.contact import Contact, ContactRegistrar, Patch
+from softtwin.registration.options import expected_force
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import expected_force, prepare
+from softtwin.registration.registrar import prepare
 from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Verdict
 

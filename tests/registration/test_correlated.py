@@ -15,8 +15,9 @@ from softtwin.registration.correlated import CorrelatedNoise, Linear, find_corre
 from softtwin.registration.evidence import Scale
 from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.lbfgs import LBFGS
+from softtwin.registration.options import Gathering, RegistrationOptions
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import Gathering, Registrar, RegistrationOptions
+from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict

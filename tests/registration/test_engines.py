@@ -16,9 +16,10 @@ from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.evidence import Scale
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hybrid import HybridRegistrar
+from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import Registrar, RegistrationOptions, register_sequence
+from softtwin.registration.registrar import Registrar, register_sequence
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict

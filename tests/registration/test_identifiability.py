@@ -13,7 +13,8 @@ from softtwin.meshes.body import Body
 from softtwin.reference.data.inputs import Change, Inputs
 from softtwin.registration.conditions import Conditions, PoissonRatio, Stiffness
 from softtwin.registration.identifiability import untold
-from softtwin.registration.registrar import Registration, prepare
+from softtwin.registration.registrar import prepare
+from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on

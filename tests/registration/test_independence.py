@@ -7,7 +7,8 @@ import pytest
 
 from softtwin.meshes.body import Body
 from softtwin.registration.independence import inflation
-from softtwin.registration.registrar import expected_force, prepare
+from softtwin.registration.options import expected_force
+from softtwin.registration.registrar import prepare
 
 from .conftest import cloud_on
 

@@ -14,9 +14,10 @@ from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.loss import Square
 from softtwin.registration.marks import Marks
+from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.pose import Pose
 from softtwin.registration.problem import Problem
-from softtwin.registration.registrar import Registrar, RegistrationOptions
+from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import ModelError, PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict

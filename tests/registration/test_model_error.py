@@ -10,9 +10,10 @@ import pytest
 from softtwin.meshes.body import Body
 from softtwin.registration.evidence import Scale, linearised
 from softtwin.registration.forward import reduce_model
+from softtwin.registration.options import options_for
 from softtwin.registration.pose import Pose
 from softtwin.registration.problem import Problem, Trial
-from softtwin.registration.registrar import Registrar, options_for
+from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import ModelError, PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict

@@ -12,7 +12,8 @@ from pcn import Law, compared, effective, walked
 from softtwin.meshes.body import Body
 from softtwin.registration.evidence import Scale
 from softtwin.registration.gauss_newton import GaussNewton
-from softtwin.registration.registrar import Gathering, Registrar, RegistrationOptions
+from softtwin.registration.options import Gathering, RegistrationOptions
+from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import nodal_forces
 

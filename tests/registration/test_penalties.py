@@ -12,9 +12,10 @@ from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.shapes import beam
 from softtwin.registration.evidence import Scale
 from softtwin.registration.lbfgs import LBFGS
+from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.penalties import Amplitude, Divergence, Penalty
-from softtwin.registration.registrar import Registrar, RegistrationOptions
+from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import Forces, nodal_forces
 

@@ -14,10 +14,12 @@ from softtwin.registration.evidence import Scale
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.loss import Square
+from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import Registrar, Registration, RegistrationOptions, register_sequence
+from softtwin.registration.registrar import Registrar, register_sequence
 from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.result import Registration
 from softtwin.registration.unknowns import Forces, PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict
 

@@ -9,7 +9,7 @@ from softtwin.meshes.body import Body
 from softtwin.registration.evidence import Scale, Scales, find_scales, linearised
 from softtwin.registration.loss import Huber, Loss, Square, Tukey, robust_deviation
 from softtwin.registration.posterior import Posterior, posterior
-from softtwin.registration.registrar import Prepared
+from softtwin.registration.prepared import Prepared
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import Forces, Informed, contact, nodal_forces, windowed
 

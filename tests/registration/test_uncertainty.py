@@ -13,9 +13,10 @@ from softtwin.meshes.embedding import embed
 from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import GaussNewton
+from softtwin.registration.options import Gathering, RegistrationOptions
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
-from softtwin.registration.registrar import Gathering, Registrar, RegistrationOptions, prepare
+from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.uncertainty import Uncertainty, unseen_response
 from softtwin.registration.unknowns import PosePrior, nodal_forces

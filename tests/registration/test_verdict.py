@@ -7,7 +7,8 @@ import pytest
 
 from softtwin.meshes.body import Body
 from softtwin.registration.evidence import Scale
-from softtwin.registration.registrar import Registrar, expected_force, prepare
+from softtwin.registration.options import expected_force
+from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.unknowns import nodal_forces
 from softtwin.registration.verdict import Verdict, shared, thickness

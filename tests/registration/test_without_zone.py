@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import ArrayLike
 
 from softtwin.meshes.body import Body
-from softtwin.registration.registrar import Gathering, RegistrationOptions, options_for, prepare
+from softtwin.registration.options import Gathering, RegistrationOptions, options_for
+from softtwin.registration.registrar import prepare
 
 from .conftest import cloud_on, seen_from_above
 

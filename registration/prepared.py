@@ -1,0 +1,56 @@
+"""Unknown forces with the reduced model between them and the observed side: what can be multiplied beforehand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .conditions import Conditions
+from .forward import ForwardModel, ReducedModel, reduce_model
+from .residuals import SurfaceDistance
+from .uncertainty import unseen_response
+from .unknowns import Forces, Informed, told
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Forces and the reduced model between them and the observed side.
+
+    Args:
+        forces: the unknown forces.
+        model: from their coefficients to the observed nodes.
+    """
+
+    forces: Forces
+    model: ReducedModel
+
+    @classmethod
+    def of(
+        cls, model: ForwardModel, observed: SurfaceDistance, forces: Forces, conditions: Conditions | None = None
+    ) -> Prepared:
+        """What can be multiplied before a cloud comes."""
+        return cls(forces, reduce_model(model, observed.nodes, forces.basis, conditions))
+
+    def informed(self, observed: SurfaceDistance, rule: Informed) -> Prepared:
+        """The directions that a cloud can tell: see `unknowns.told`."""
+        kept = told(self.model, observed, rule)
+        return Prepared(self.forces.combined(kept), self.model.combined(kept))
+
+    def leading(self, count: int) -> Prepared:
+        """The first directions alone."""
+        return Prepared(self.forces.leading(count), self.model.combined(np.eye(self.forces.size)[:, :count]))
+
+    @cached_property
+    def unseen(self) -> Floats:
+        """Displacements by the directions of force that were left out, for unit scale, (3n, r)."""
+        return unseen_response(self.model, self.forces)
+
+    def believing(self, spread: float) -> Prepared:
+        """The same with another spread of the logarithm of the forces' size."""
+        scale = replace(self.forces.scale, spread=spread)
+        return replace(self, forces=replace(self.forces, scale=scale))

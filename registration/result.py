@@ -1,0 +1,163 @@
+"""What a registered cloud says: the state with its forces, their doubt, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from .conditions import Estimate
+from .forward import State
+from .gauss_newton import LocalModel, Step
+from .outcome import Outcome
+from .pose import Pose
+from .posterior import Posterior
+from .prepared import Prepared
+from .problem import Problem, Trial
+from .uncertainty import Uncertainty, uncertainty
+from .verdict import Judgement, Verdict
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """One registered cloud.
+
+    Args:
+        prepared: the forces' basis that its coefficients belong to.
+        trial: where the solver ended; the next frame starts there.
+        forces: nodal forces, (n, 3), newtons.
+        state: the body's state as the model has it, with its derivatives.
+        correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres; with
+            it what a pose that was said to be known is off by.
+        doubt: how large the model's error was found, in units of its samples'; 1 where it is not known in patterns.
+        alike: so many points tell what one would that errs by itself; 1 where each does.
+        pose: from the body's coordinates to the cloud's.
+        askew: what a pose that was said to be known is off by: a motion in the body's coordinates.
+        net_force: (3,), newtons.
+        net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
+        noise: standard deviation of a point's distance that was found, metres.
+        force_scale: standard deviation of the force coefficients that was found, newtons.
+        rms_distance: of the cloud to the registered surface, metres.
+        outliers: share of the points that pulled nothing.
+        informed: directions of force and pose that the cloud told.
+        points: points that were used, after thinning.
+        outcome: how the solver ended.
+        judgement: whether the result can be used, and why not.
+        evaluations: forward solves.
+        seconds: wall time.
+        trace: one entry an iteration.
+        problem: what was solved, for the cloud and the model's error as they were taken in the end.
+        posterior: of the coefficients.
+        local: the objective's model there; None for a result that was put together otherwise.
+        looked_for: so many frames on noise that neighbours share was looked for and not found; 0 where it was not.
+        draft: what a faster model had found, where this one went on from there.
+    """
+
+    prepared: Prepared
+    trial: Trial
+    forces: Floats
+    state: State
+    correction: Floats
+    doubt: float
+    alike: float
+    pose: Pose
+    askew: Pose
+    net_force: Floats
+    net_force_covariance: Floats
+    noise: float
+    force_scale: float
+    rms_distance: float
+    outliers: float
+    informed: float
+    points: int
+    outcome: Outcome
+    judgement: Judgement
+    evaluations: int
+    seconds: float
+    trace: tuple[Step, ...]
+    problem: Problem
+    posterior: Posterior
+    local: LocalModel | None = None
+    looked_for: int = 0
+    draft: Registration | None = None
+
+    @property
+    def coefficients(self) -> Floats:
+        """Of forces, pose, conditions and model error, (k,)."""
+        return self.trial.coefficients
+
+    @cached_property
+    def scatter(self) -> float:
+        """Standard deviation of a point's distance with what neighbours share of its noise, metres."""
+        return float(np.sqrt(self.noise**2 + np.mean(self.problem.shared_noise(self.trial) ** 2)))
+
+    @property
+    def unknown_forces(self) -> Floats:
+        """Nodal forces of the basis, (n, 3), without those of conditions: newtons on a body as stiff as expected."""
+        return self.prepared.forces.forces(self.coefficients[self.problem.force_part])
+
+    @property
+    def displacement(self) -> Floats:
+        """Of all nodes, (n, 3), metres, in the body's coordinates: the state's with the correction."""
+        return self.state.displacement + self.correction
+
+    @property
+    def net_force_deviation(self) -> Floats:
+        """Standard deviation of each component of the net force, (3,), newtons."""
+        return np.sqrt(np.diag(self.net_force_covariance))
+
+    @cached_property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """What is known of stiffness and other unknowns beside the forces; none where there are none."""
+        conditions, part = self.problem.conditions, self.problem.condition_part
+        if conditions is None:
+            return ()
+        return conditions.estimates(self.coefficients[part], self.posterior.covariance[part, part])
+
+    @cached_property
+    def chance_of_pose(self) -> float:
+        """Chance that a pose which is just as expected seems so far from it; 1 where none is unknown.
+
+        The distance between the two in the posterior's deviations, against chi-square's law.
+        """
+        part = self.problem.pose_part
+        off, covariance = self.coefficients[part], self.posterior.covariance[part, part]
+        return float(chi2.sf(off @ np.linalg.solve(covariance, off), len(off))) if len(off) else 1.0
+
+    @cached_property
+    def force_over_modulus(self) -> tuple[Floats, Floats] | None:
+        """Net force over Young's modulus, (3,), square metres, and its standard deviation, (3,).
+
+        It is all that a state under nodal forces and fixed supports depends on. None where the modulus is no unknown.
+        """
+        conditions, problem = self.problem.conditions, self.problem
+        unknown = None if conditions is None else conditions.modulus
+        if conditions is None or unknown is None:
+            return None
+        place, deviation = problem.condition_part.start + unknown[0], unknown[1]
+        modulus = float(
+            np.mean(conditions.inputs(self.coefficients[problem.condition_part]).parameters["young_modulus"])
+        )
+        slopes = problem.net_forces(self.trial) / modulus
+        slopes[:, place] -= deviation * self.net_force / modulus
+        covariance = self.posterior.net_force_covariance(slopes, problem.forces.left_out / modulus**2)
+        return self.net_force / modulus, np.sqrt(np.diag(covariance))
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """How far each point of the body may be from where it was found; computed when it is first asked for.
+
+        It holds for what the problem reckons with: noise, forces like those expected, the model's error where its
+        patterns are known. Wrong stiffness, attachment or shape of the body are not among them.
+        """
+        return uncertainty(self.problem, self.trial, self.posterior, self.prepared.unseen)
+
+
+def badness(result: Registration) -> tuple[int, float]:
+    """By which results for one cloud are ordered, the best first."""
+    return list(Verdict).index(result.judgement.verdict), result.scatter
