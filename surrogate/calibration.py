@@ -176,7 +176,7 @@ class Coverage:
         confidence: share that the bounds are made for.
         kept: share of the samples whose error keeps its bound, for each kind of error.
         kept_in_range: the same in each range of size; None where no sample fell.
-        widths: median bound over median error in each range, likewise.
+        widths: median bound over median error in each range, likewise; None too where most have no bound.
         in_range: samples in each range.
         rank_correlation: Spearman's, of bound and error; None where they do not vary.
         step_correlation: the same of eta, the linear step towards balance (`Signs.step`), alone.
@@ -267,7 +267,9 @@ def _mean(values: NDArray[Any]) -> float | None:
 
 
 def _ratio(bounds: Floats, errors: Floats) -> float | None:
-    return float(np.median(bounds) / np.median(errors)) if len(errors) else None
+    if not len(errors) or not np.isfinite(np.median(bounds)) or np.median(errors) == 0.0:
+        return None
+    return float(np.median(bounds) / np.median(errors))
 
 
 def _compare_loads(surrogate: Surrogate, data: DataSet, split: Split) -> None:
@@ -353,6 +355,8 @@ def _usual_load(before: list[Signs], seen: list[Signs], confidence: float) -> di
 def quantile(scores: Floats, confidence: float, paths: Ints | None = None) -> float | None:
     """The score that at least such a share of further ones keeps on average; None where there are too few to say.
 
+    None, too, where that score would be infinite.
+
     Args:
         scores: (s,).
         confidence: the share.
@@ -364,7 +368,8 @@ def quantile(scores: Floats, confidence: float, paths: Ints | None = None) -> fl
     order = np.argsort(scores, kind="stable")
     reached = np.cumsum(1.0 / counts[place[order]]) if len(order) else np.zeros(0)
     kept = np.flatnonzero(reached >= (len(counts) + 1) * confidence - 1e-9)
-    return float(scores[order[kept[0]]]) if len(kept) else None
+    found = float(scores[order[kept[0]]]) if len(kept) else np.inf
+    return found if np.isfinite(found) else None
 
 
 def _limit(values: list[float], share: float) -> float:

@@ -196,6 +196,21 @@ def test_a_network_that_turns_cells_inside_out_is_calibrated_without_a_bound_for
     assert lost and all(each.mean == np.inf and not each.is_inside for each in lost)
 
 
+@pytest.mark.parametrize("times", [20.0, 60.0])
+def test_a_certificate_without_bounds_is_stored_with_how_it_did(
+    bare: Surrogate, data: DataSet, times: float, tmp_path: Path
+) -> None:
+    """Nearly all predictions of a network that learned nothing are inside out: no width, no infinity in the file."""
+    wild = Surrogate(bare.body, bare.maps, copy.deepcopy(bare.network), bare.card)
+    for weights in wild.network.parameters():
+        weights.mul_(times)
+    made = calibrate(wild, data)
+    found = coverage(made, data)
+    assert all(None in found.widths[error] and "-" in str(found) for error in ("mean", "largest"))
+    save(made.with_card(certificate={**made.card["certificate"], "held_out": found.as_dict()}), tmp_path)
+    assert load(tmp_path, data.body).card["certificate"]["held_out"]["widths"] == found.widths
+
+
 def test_no_load_is_certain(surrogate: Surrogate, small: Body) -> None:
     found = Certifier(surrogate).certify(np.zeros_like(small.points))
     assert found.mean < 1e-9 and found.is_inside
