@@ -32,6 +32,7 @@ _SIZE, _SIZE_SPREAD = 5e-4, 1.0  # metres, and of its logarithm: what is believe
 _LENGTH, _LENGTH_SPREAD = 0.15, 0.5  # of the cloud's extent, and of its logarithm
 _STARTS = 0.5, 1.0, 2.0  # times the length that is believed
 _LARGEST, _LONGEST = 5e-3, 0.4  # metres, of the extent: beyond, it is no noise but another place or shape
+_BELOW = 0.8  # of the largest
 _QUIET, _STRONG = 0.2, 10.0  # of the noise and the forces that are expected: where forces explain the noise
 _EVALUATIONS = 160
 _NEVER = 1e12  # minus the logarithm of the chance of scales with no covariance
@@ -144,8 +145,15 @@ class Linear:
         return Linear(**{name: getattr(self, name)[every] for name in names})
 
 
+def is_noise(size: float) -> bool:
+    """Whether so large a shift that neighbours share, metres, may be one of noise."""
+    return size < _BELOW * _LARGEST
+
+
 def find_correlated(linear: Linear, noise: Scale, force: Scale, worth: float) -> tuple[float, float] | None:
     """Size and length of the noise that neighbours share, metres; None where the cloud does without.
+
+    A size near the largest (`is_noise`) would be larger, if it might: it stands for what no force explains.
 
     Both pictures are taken at their most likely scales, with what is believed of these beforehand.
 

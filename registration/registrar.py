@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, reduce
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +19,7 @@ from softtwin.reference.data.outcome import NotConverged
 from .anchored import Anchored
 from .cloud import Cloud
 from .conditions import Conditions
-from .correlated import CorrelatedNoise
+from .correlated import CorrelatedNoise, is_noise
 from .evidence import Scale
 from .forward import ForwardModel, ReducedModel, reduce_model
 from .gauss_newton import Found, GaussNewton
@@ -204,15 +205,20 @@ class Registrar:
             now = time.monotonic()
             hurried = self.limited(now + _SEARCHING * (self.options.solver.until - now))
             return hurried._afresh(points, begin, result)
-        if 0 < start.looked_for < _AGAIN:
-            return replace(result, looked_for=start.looked_for + 1)
+        if like.correlated is not None or 0 < start.looked_for < _AGAIN:
+            return _carried(result, start)
         return like._told_apart(result, lambda other, near: other._sought_anew(points, near, begin))
 
     def _afresh(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
-        """From rest, and once more where neighbours are found to share noise; see `_cold`."""
+        """From rest, and once more where neighbours are found to share noise; see `_cold`.
+
+        What is known and meets the cloud as well stays: it may know more of the forces' size than a search from rest.
+        """
         found = self._cold(points, begin, known)
         if found is known:
             return found
+        if known is not None:
+            found = replace(min(found, known, key=badness), seconds=time.perf_counter() - begin)
         return self._told_apart(found, lambda other, near: other._sought_anew(points, near, begin))
 
     def _followed(self, points: Cloud, start: Registration, begin: float) -> Registration:
@@ -233,29 +239,37 @@ class Registrar:
 
         Forces have explained such noise as far as they can: only where it is left to itself it is seen as it is, so
         that a guess is good enough for a second try, and that one decides. What is shared over less than the edges of
-        the surface is the mesh's own, or noise that no force can follow: for that points are counted (`alike`).
+        the surface is the mesh's own, or noise that no force can follow: for that points are counted (`alike`). What
+        would be larger than any noise, and leaves the search without an end, is none: nothing here explains it.
         """
         if not self.options.correlated or found.problem.correlated is not None or found.local is None:
             return found
         is_worth_it = found.outcome is not Outcome.REFUSED and found.noise < _HOPELESS * self.expectations.noise
         if not is_worth_it or not _is_shared(found, self.noise.least):
             return found
-        told, best = found.local.correlated(_A_TRY), found
+        told, best, near = found.local.correlated(_A_TRY), found, found
         for _ in range(_TRIES):
-            if told is None or told[1] < _EDGES * self.observed.edge:
+            if not self._is_followed(told):
                 break
             if self._is_late:
-                return _out_of_time(best, told)
+                return _out_of_time(best, told[1])
             try:
-                other = again(self.believing(_noise_of(best, *told)), best)
+                near = again(self.believing(_noise_of(near, *told)), near)
             except NotConverged:
                 break
-            before, told = told, None if other.local is None else other.local.correlated(_WORTH)
-            if told is not None and told[1] >= _EDGES * self.observed.edge:
-                best = other
+            before, told = told, None if near.local is None else near.local.correlated(_WORTH)
+            if self._is_followed(told):
+                best = near if near.outcome.is_success or _is_noise(near.problem.correlated) else best
                 if np.abs(np.log(np.divide(told, before))).max() < _SAME:
                     break
-        return replace(best, looked_for=int(best is found))
+        is_tried = near is not found
+        if best is found and is_tried and self._is_followed(told) and not is_noise(told[0]):
+            best = _of_no_force(best, told[1])
+        return replace(best, looked_for=int(best.problem.correlated is None))
+
+    def _is_followed(self, told: tuple[float, float] | None) -> TypeGuard[tuple[float, float]]:
+        """Whether there is such noise, of a length that forces could follow."""
+        return told is not None and told[1] >= _EDGES * self.observed.edge
 
     @property
     def _is_late(self) -> bool:
@@ -286,9 +300,9 @@ class Registrar:
             noise = _still_there(last.problem.correlated, points)
         like = self.believing(noise)
         found = like._refined(points, draft, fast, last, begin)
-        before = 0 if last is None else last.looked_for
-        if 0 < max(draft.looked_for, before) < _AGAIN:
-            found = replace(found, looked_for=max(draft.looked_for, before + 1))
+        before, drafted = 0 if last is None else last.looked_for, draft.looked_for if draft.unexplained == 0.0 else 0
+        if 0 < max(drafted, before) < _AGAIN:
+            found = replace(found if last is None else _carried(found, last), looked_for=max(drafted, before + 1))
         else:
             found = like._told_apart(found, lambda other, _: other._refined(points, draft, fast, None, begin))
         return replace(found, draft=draft)
@@ -660,14 +674,30 @@ def prepare(
     )
 
 
-def _out_of_time(found: Registration, told: tuple[float, float]) -> Registration:
+def _out_of_time(found: Registration, length: float) -> Registration:
     """The result, doubtful for noise that there was no time to tell from forces."""
-    size, length = (1e3 * value for value in told)
-    reason = (
-        f"points within {length:.0f} mm of each other err alike, by {size:.1f} mm, and no time was left to tell that "
-        "from forces"
-    )
-    return replace(found, judgement=Judgement(Verdict.DOUBTFUL, (*found.judgement.reasons, reason)))
+    return _doubtful(found, length, "and no time was left to tell that from forces")
+
+
+def _of_no_force(found: Registration, length: float) -> Registration:
+    """The result, doubtful for what neighbours share, is too large for noise, and is explained by no force."""
+    why = "by more than noise does: no forces that are expected bring the organ there"
+    return replace(_doubtful(found, length, why), unexplained=length)
+
+
+def _carried(result: Registration, before: Registration) -> Registration:
+    """The result with what the frame before has found of points that err alike, which is not looked for anew."""
+    if before.unexplained > 0.0:
+        result = _of_no_force(result, before.unexplained)
+    return result if before.looked_for == 0 else replace(result, looked_for=before.looked_for + 1)
+
+
+def _doubtful(found: Registration, length: float, why: str) -> Registration:
+    """The result with one reason more: neighbours within a length, metres, err alike."""
+    judgement = found.judgement
+    worst = Verdict.DOUBTFUL if judgement.is_usable else judgement.verdict
+    reason = f"points within {1e3 * length:.0f} mm of each other err alike, {why}"
+    return replace(found, judgement=Judgement(worst, (*judgement.reasons, reason)))
 
 
 def _resized(found: Found, part: slice) -> float:
@@ -690,6 +720,10 @@ def _is_shared(found: Registration, least: float) -> bool:
 def _noise_of(found: Registration, size: float, length: float) -> CorrelatedNoise:
     """Noise of a size and a length, metres, for the cloud of a result."""
     return CorrelatedNoise.over(found.problem.cloud, found.problem.normals(found.trial), size, length)
+
+
+def _is_noise(correlated: CorrelatedNoise | None) -> bool:
+    return correlated is not None and is_noise(correlated.size)
 
 
 def _still_there(correlated: CorrelatedNoise | None, points: Cloud) -> CorrelatedNoise | None:

@@ -55,6 +55,8 @@ class Registration:
         posterior: of the coefficients.
         local: the objective's model there; None for a result that was put together otherwise.
         looked_for: so many frames on noise that neighbours share was looked for and not found; 0 where it was not.
+        unexplained: neighbours within so much of each other, metres, share more than noise, which no force explains; 0
+            for none.
         draft: what a faster model had found, where this one went on from there.
     """
 
@@ -84,6 +86,7 @@ class Registration:
     posterior: Posterior
     local: LocalModel | None = None
     looked_for: int = 0
+    unexplained: float = 0.0
     draft: Registration | None = None
 
     @property

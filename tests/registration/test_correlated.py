@@ -11,14 +11,18 @@ import pytest
 from numpy.typing import ArrayLike
 
 from softtwin.meshes.body import Body
-from softtwin.registration.correlated import CorrelatedNoise, Linear, find_correlated
+from softtwin.registration.cloud import Cloud
+from softtwin.registration.correlated import CorrelatedNoise, Linear, find_correlated, is_noise
 from softtwin.registration.evidence import Scale
+from softtwin.registration.gauss_newton import LocalModel
 from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.lbfgs import LBFGS
-from softtwin.registration.options import Gathering, RegistrationOptions
+from softtwin.registration.options import Belief, Gathering, RegistrationOptions
+from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.result import Registration, badness
 from softtwin.registration.unknowns import PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict
 
@@ -178,6 +182,55 @@ def test_what_is_shared_over_less_than_the_edges_only_counts_points(rng: np.rand
     again = registrar(coarse).follow(shaken(cloud, rng), found)
     assert again.looked_for == 2  # a frame on
     assert found.alike > 2.0
+
+
+def test_what_is_larger_than_noise_is_called_so(rng: np.random.Generator) -> None:
+    """Two centimetres over three: the size ends at its bound, and stands for what no force explains."""
+    points = sphere(600, rng)
+    along = np.einsum("pi,pi->p", 2e-2 * field(points, 0.03, rng), points / 0.1)
+    found = find_correlated(linear(along, points), Scale(5e-4, 1.5, least=1e-4), Scale(1e-3, 1.0), 5.0)
+    assert found is not None and not is_noise(found[0])
+    assert is_noise(SIZE)
+
+
+def test_what_no_force_explains_is_doubtful_and_so_are_frames_that_follow(
+    body: Body, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is no unknown beside the forces: the state stays the one that was found without."""
+    made, cloud = registrar(body), shaken(cloud_on(body, truth(body), 400, rng), rng)
+    without = Registrar(made.model, made.observed, made.forces, replace(made.options, correlated=False))
+
+    def in_vain(self: Registrar, points: Cloud, near: Registration, begin: float) -> Registration:
+        return replace(near, outcome=Outcome.NO_DESCENT, problem=replace(near.problem, correlated=self.correlated))
+
+    monkeypatch.setattr(LocalModel, "correlated", lambda self, worth: (4.9e-3, LENGTH))
+    monkeypatch.setattr(Registrar, "_sought_anew", in_vain)
+    found = made.register(cloud)
+    np.testing.assert_array_equal(found.displacement, without.register(cloud).displacement)
+    assert found.problem.correlated is None and found.unexplained == LENGTH
+    monkeypatch.undo()
+    again = made.register(cloud, found)
+    assert (found.looked_for, again.looked_for) == (1, 2)
+    for each in (found, again):
+        assert each.judgement.verdict is Verdict.DOUBTFUL
+        assert "within 100 mm of each other err alike, by more than noise does" in each.judgement.reasons[-1]
+
+
+def test_a_frame_that_is_noisier_keeps_what_is_known_of_the_forces_if_it_is_met_as_well(body: Body) -> None:
+    """A clear cloud has told their size; noise tells it to nobody who begins at rest."""
+    scale = Scale(0.005, 0.5, least=1e-5)
+    forces = nodal_forces(body, body.node_sets["tip"], scale)
+    options = RegistrationOptions(gathering=Gathering(rounds=0), belief=Belief(clear=2e-4))
+    made, kept = Registrar(Cantilever(body), SurfaceDistance(body, body.surfaces["observed"]), forces, options), []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        clear = made.register(cloud_on(body, truth(body), 400, rng))
+        noisy = cloud_on(body, truth(body), 400, rng, 1e-3)
+        found, afresh = made.register(noisy, clear), made.register(noisy)
+        assert badness(found) <= badness(afresh)
+        kept.append(abs(np.log(found.force_scale / clear.force_scale)) < 0.1)
+        assert abs(np.log(afresh.force_scale / clear.force_scale)) > 0.5
+    assert any(kept)
 
 
 def test_a_clean_cloud_knows_of_none(body: Body, rng: np.random.Generator) -> None:
