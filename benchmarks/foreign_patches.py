@@ -22,7 +22,7 @@ from liver import SEQUENCES, sequence
 from networks import RUNS
 from numpy.typing import NDArray
 from record import recorded, stamp, write
-from robustness import clean, forward_model, registrar_for
+from robustness import clean, forward_model, registrar_for, towards_camera
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.body import Body
@@ -33,13 +33,6 @@ Floats = NDArray[np.float64]
 Moved = Callable[[Floats, Body, np.random.Generator], Floats]
 NAME, FRAMES = "foreign_patches", (5, 15, 25, 40)
 _RADIUS, _REACH = 5e-3, 0.02  # of the shaft; how far it goes beyond the point it reaches for, metres
-
-
-def towards_camera(body: Body) -> Floats:
-    """The mean normal of the side that is seen, (3,)."""
-    corners = body.points[body.surfaces["observed"]]
-    view = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
-    return view / np.linalg.norm(view)
 
 
 def raised(share: float, millimetres: float) -> Moved:

@@ -44,13 +44,18 @@ def noisy(millimetres: float) -> Callable[[Floats, Body, Generator], Floats]:
     return lambda cloud, body, rng: cloud + 1e-3 * millimetres * rng.standard_normal(cloud.shape)
 
 
+def towards_camera(body: Body) -> Floats:
+    """The mean normal of the side that is seen, (3,)."""
+    corners = body.points[body.surfaces["observed"]]
+    view = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+    return view / np.linalg.norm(view)
+
+
 def along_the_view(millimetres: float) -> Callable[[Floats, Body, Generator], Floats]:
     """Noise of depth alone, as a camera that looks straight at the observed side has it."""
 
     def moved(cloud: Floats, body: Body, rng: Generator) -> Floats:
-        corners = body.points[body.surfaces["observed"]]
-        view = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
-        return cloud + 1e-3 * millimetres * rng.standard_normal((len(cloud), 1)) * view / np.linalg.norm(view)
+        return cloud + 1e-3 * millimetres * rng.standard_normal((len(cloud), 1)) * towards_camera(body)
 
     return moved
 

@@ -16,7 +16,6 @@ from .conditions import Conditions, Estimate, check_deviation, estimate
 from .registrar import Registrar
 from .result import Registration
 from .unknowns import known_forces
-from .verdict import Judgement, Verdict
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -163,15 +162,12 @@ class ContactRegistrar:
             return replace(draft, seconds=time.perf_counter() - begin)
         found = self._registrar(draft).believing(draft.problem.correlated).register(cloud)
         least = max(draft.scatter, self.anywhere.noise.least)
-        judgement = found.judgement
         if found.scatter > _WORSE * least:
-            reason = (
+            found = found.doubted(
                 f"one contact does not explain the cloud: points lie {1e3 * found.scatter:.2f} mm from the surface, "
                 f"with forces anywhere {1e3 * draft.scatter:.2f} mm"
             )
-            verdict = Verdict.REFUSED if judgement.verdict is Verdict.REFUSED else Verdict.DOUBTFUL
-            judgement = Judgement(verdict, (*judgement.reasons, reason))
-        return replace(found, judgement=judgement, draft=draft, seconds=time.perf_counter() - begin)
+        return replace(found, draft=draft, seconds=time.perf_counter() - begin)
 
     def _registrar(self, draft: Registration) -> Registrar:
         body, anywhere = self.anywhere.model.body, self.anywhere

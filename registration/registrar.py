@@ -34,7 +34,7 @@ from .problem import Problem, Trial
 from .residuals import SurfaceDistance
 from .result import Registration, badness
 from .unknowns import Forces, Informed, ModelError, PosePrior, contact, known_forces, nodal_forces, windowed
-from .verdict import Expectations, Judgement, Verdict, judge, shared
+from .verdict import Expectations, Verdict, judge, shared
 
 Floats = NDArray[np.float64]
 # Of the logarithm of a nodal force: with more, forces explain noise and the model's error. Without either, a pull at a
@@ -186,8 +186,7 @@ class Registrar:
                     f"forces outside the zone explain the cloud better: points lie {1e3 * found.rms_distance:.2f} mm "
                     f"from the surface, with forces anywhere {1e3 * other.rms_distance:.2f} mm"
                 )
-                reasons = (*found.judgement.reasons, reason)
-                return replace(found, judgement=Judgement(Verdict.DOUBTFUL, reasons))
+                return found.doubted(reason)
         return found
 
     def _registered(self, cloud: ArrayLike, start: Registration | None) -> Registration:
@@ -694,10 +693,7 @@ def _carried(result: Registration, before: Registration) -> Registration:
 
 def _doubtful(found: Registration, length: float, why: str) -> Registration:
     """The result with one reason more: neighbours within a length, metres, err alike."""
-    judgement = found.judgement
-    worst = Verdict.DOUBTFUL if judgement.is_usable else judgement.verdict
-    reason = f"points within {1e3 * length:.0f} mm of each other err alike, {why}"
-    return replace(found, judgement=Judgement(worst, (*judgement.reasons, reason)))
+    return found.doubted(f"points within {1e3 * length:.0f} mm of each other err alike, {why}")
 
 
 def _resized(found: Found, part: slice) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -88,6 +88,12 @@ class Registration:
     looked_for: int = 0
     unexplained: float = 0.0
     draft: Registration | None = None
+
+    def doubted(self, reason: str) -> Registration:
+        """The same with a reason more to doubt it; what is refused stays so."""
+        judged = self.judgement
+        verdict = Verdict.DOUBTFUL if judged.is_usable else judged.verdict
+        return replace(self, judgement=Judgement(verdict, (*judged.reasons, reason)))
 
     @property
     def coefficients(self) -> Floats:
