@@ -12,7 +12,6 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from .body import Body, Floats, Ints, Surface
-from .closest import closest_points
 from .elements import linear_kind, split_facets
 from .quadrature import shape_functions
 
@@ -217,6 +216,8 @@ def _depths(body: Body, cells: Ints, points: Floats) -> Floats:
 
 def _nearest(body: Body, points: Floats) -> tuple[Ints, Floats, Floats]:
     """Cells at the nearest points of the boundary, these points and their distances."""
+    from .closest import closest_points  # VTK: training and prediction on a machine without it never come here
+
     nearest, triangles = closest_points(body.boundary_surface, points)
     distances = np.linalg.norm(points - nearest, axis=1)
     return _owners(body)[triangles], nearest, distances

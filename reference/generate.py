@@ -29,13 +29,10 @@ from .data.dataset import (
     DataSet,
     DataSetError,
     LinearResponse,
-    create,
     differences,
-    drop_block,
     existing,
     probe_cotangents,
     stored_plan,
-    write_block,
 )
 from .data.lock import locked
 from .data.materials import MATERIALS, Material
@@ -43,6 +40,7 @@ from .data.outcome import Equilibrium, NotConverged
 from .data.part import Part, at_work_on, refuse_parts_at_work
 from .data.samplers import LoadPlan, QuasiRandom, check_loads, draw_load, loaded_nodes, sobol_point
 from .data.schema import Reason
+from .data.writing import create, drop_block, write_block
 from .farm import Task, quiet, share_out
 from .fem.fenicsx import MPI, PETSc, dolfinx
 from .modes import eigenmodes

@@ -12,18 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import splu
 
 from softtwin.meshes.body import Body
-from softtwin.reference.data.dataset import (
-    NEEDED,
-    SPLITS,
-    DataSet,
-    DataSetError,
-    LinearResponse,
-    Split,
-    create,
-    write_block,
-)
+from softtwin.reference.data.dataset import NEEDED, SPLITS, DataSet, DataSetError, LinearResponse, Split
 from softtwin.reference.data.materials import MATERIALS, Material
 from softtwin.reference.data.schema import Reason, Sizes
+from softtwin.reference.data.writing import create, write_block
 
 from .residual import ElasticBody
 

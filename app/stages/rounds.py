@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from softtwin.reference.data.dataset import DataSet, write_chosen
+from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.writing import write_chosen
 from softtwin.reference.generate import candidate_loads, plan_from_header, solve_block
 from softtwin.surrogate.acquisition import most_telling
 from softtwin.surrogate.model import Surrogate

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from .dataset import DataSet, DataSetError
@@ -43,7 +42,7 @@ def stored_modes(data: DataSet) -> Floats | None:
     Raises:
         DataSetError: they are damaged.
     """
-    group = _group(data.path)
+    group = _group(data)
     if group is None:
         return None
     modes = _read(data.path, group, "modes", slice(None))
@@ -62,7 +61,7 @@ def read_jacobians(data: DataSet, draws: Ints) -> Jacobians | None:
     Raises:
         DataSetError: some of them were never finished, are damaged, or hold numbers that are not finite.
     """
-    modes, group = stored_modes(data), _group(data.path)
+    modes, group = stored_modes(data), _group(data)
     if modes is None or group is None:
         return None
     size = data.header["block"]
@@ -84,14 +83,14 @@ def read_jacobians(data: DataSet, draws: Ints) -> Jacobians | None:
 
 def missing_jacobians(data: DataSet) -> list[int]:
     """Numbers of the blocks whose Jacobians are still to be made, or again; all where there are none."""
-    group = _group(data.path)
+    group = _group(data)
     blocks = _blocks(data)
     return [block for block in blocks if group is None or _state(data.path, group, block, data.header["block"])]
 
 
 def mark(data: DataSet) -> str:
     """SHA-256 of the checksums of all Jacobians, empty where there are none: another one, others to learn from."""
-    group = _group(data.path)
+    group = _group(data)
     if group is None:
         return ""
     return hashlib.sha256(f"{group.attrs['checksum']} {group['checksum'][:].tolist()}".encode()).hexdigest()
@@ -105,9 +104,9 @@ def prepare_jacobians(data: DataSet, modes: Floats) -> list[int]:
         modes: V, (3n, r).
     """
     size, blocks = data.header["block"], _blocks(data)
-    group = _group(data.path)
+    group = _group(data)
     if group is None or not _are(data, modes):
-        root = zarr.open_group(str(data.path), mode="r+")
+        root = _writable(data.path)
         group, rank = root.create_group(_GROUP, overwrite=True), modes.shape[1]
         group.create_array("modes", data=np.ascontiguousarray(modes))
         places = blocks[-1] + 1  # those of blocks that are not learned from stay empty
@@ -128,7 +127,7 @@ def write_jacobians(path: Path, block: int, values: Floats, squares: Floats) -> 
         values: (block size, r, r), m/N; zero for draws that were not accepted.
         squares: (block size,), (m/N)^2.
     """
-    group = zarr.open_group(str(path), mode="r+")[_GROUP]
+    group = _writable(path)[_GROUP]
     part = slice(block * len(squares), (block + 1) * len(squares))
     typed = np.asarray(values, dtype=np.float32), np.asarray(squares, dtype=np.float64)
     group["values"][part], group["squares"][part] = typed
@@ -144,8 +143,14 @@ def _blocks(data: DataSet) -> list[int]:
     return [block for draws in data.ranges("train") for block in range(draws.start // size, -(-draws.stop // size))]
 
 
-def _group(path: Path) -> Any:
-    root = zarr.open_group(str(path), mode="r")
+def _writable(path: Path) -> Any:
+    import zarr  # here: who only reads Jacobians from a tensors file needs none of it
+
+    return zarr.open_group(str(path), mode="r+")
+
+
+def _group(data: DataSet) -> Any:
+    root = data.root  # opened anew where it is a folder: another may have written meanwhile
     return root[_GROUP] if _GROUP in root and "checksum" in root[_GROUP].attrs else None
 
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .dataset import NEEDED, SPLITS, DataSet, DataSetError, Split, create, stored_plan, write_block
+from .dataset import NEEDED, SPLITS, DataSet, DataSetError, Split, stored_plan
+from .writing import create, write_block
 
 _SAME = ("material", "young_modulus", "poisson_ratio")
 

@@ -15,10 +15,11 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_fields
 from softtwin.meshes.shapes import beam
-from softtwin.reference.data.dataset import DataSet, DataSetError, drop_block
+from softtwin.reference.data.dataset import DataSet, DataSetError
 from softtwin.reference.data.merge import merge
 from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.data.summary import summary
+from softtwin.reference.data.writing import drop_block
 from softtwin.reference.differentiate import differentiate
 from softtwin.reference.generate import Plan, generate, plan_from_header
 from softtwin.reference.solve.problem import NewtonOptions

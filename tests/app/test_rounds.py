@@ -21,11 +21,12 @@ from softtwin.app.stages.learn import train_stage, validate_stage
 from softtwin.app.stages.mesh import mesh_stage
 from softtwin.app.workspace import Workspace, open_workspace
 from softtwin.meshes.shapes import beam
-from softtwin.reference.data.dataset import NEEDED, DataSet, DataSetError, drop_block, write_chosen
+from softtwin.reference.data.dataset import NEEDED, DataSet, DataSetError
 from softtwin.reference.data.jacobians import missing_jacobians, read_jacobians
 from softtwin.reference.data.merge import merge
 from softtwin.reference.data.part import Part
 from softtwin.reference.data.summary import summary
+from softtwin.reference.data.writing import drop_block, write_chosen
 from softtwin.reference.generate import candidate_loads, plan_from_header, ramp_loads, solve_block
 from softtwin.surrogate.acquisition import most_telling, spread_out
 from softtwin.surrogate.model import Surrogate

@@ -14,9 +14,10 @@ import pytest
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.shapes import beam
-from softtwin.reference.data.dataset import DataSet, DataSetError, drop_block
+from softtwin.reference.data.dataset import DataSet, DataSetError
 from softtwin.reference.data.jacobians import mark, missing_jacobians, read_jacobians, stored_modes
 from softtwin.reference.data.samplers import LoadPlan
+from softtwin.reference.data.writing import drop_block
 from softtwin.reference.differentiate import differentiate
 from softtwin.reference.generate import Plan, generate
 from softtwin.reference.solve.problem import Problem

@@ -21,10 +21,10 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.data import dataset
-from softtwin.reference.data.dataset import SPLITS, DataSet, DataSetError, Split, drop_block, probe_cotangents
+from softtwin.reference.data.dataset import SPLITS, DataSet, DataSetError, Split, probe_cotangents
 from softtwin.reference.data.part import Part, at_work_on
 from softtwin.reference.data.samplers import LoadPlan, QuasiRandom, sobol_point
+from softtwin.reference.data.writing import drop_block, write_block
 from softtwin.reference.generate import DamagedBlock, Plan, generate, linear_response, solve_block
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 
@@ -480,7 +480,7 @@ def test_a_full_disk_keeps_what_was_whole(undisturbed: DataSet, tmp_path: Path, 
         if written:
             raise OSError(28, "No space left on device")
         written.append(block)
-        dataset.write_block(target, block, arrays)
+        write_block(target, block, arrays)
 
     monkeypatch.setattr(farm, "write_block", full)
     with pytest.raises(OSError, match="No space left"):

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.metrics import HEXAHEDRON_EDGES
 from softtwin.meshes.shapes import beam
-from softtwin.reference.data.dataset import DataSet, LinearResponse, create, write_block
+from softtwin.reference.data.dataset import DataSet, LinearResponse
 from softtwin.reference.data.schema import Reason
+from softtwin.reference.data.writing import create, write_block
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
