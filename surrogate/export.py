@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from .exported import FILES, FORMAT, MANIFEST, digest
 from .model import Surrogate
+from .precision import without_tf32
 from .twin import NOTICE
 
 Floats = NDArray[np.float64]
@@ -74,21 +75,24 @@ class Linearised(Value):
         return self.offset + self.linear @ coefficients + self._decoded(at.values[:, None])[:, 0], slopes
 
 
-def leading_directions(surrogate: Surrogate, count: int) -> Floats:
+def leading_directions(surrogate: Surrogate, count: int, device: str = "cpu") -> Floats:
     """The directions of force at the loaded nodes that move the body most, seen from rest: (3l, k), orthonormal.
 
     Args:
         surrogate: the surrogate.
         count: most directions wanted.
+        device: where the whole Jacobian at rest is made, a tangent for each force: on a GPU in single precision, since
+            a large U-Mesh takes minutes for it on a processor.
 
     Raises:
         ValueError: fewer than one.
     """
     if count < 1:
         raise ValueError(f"leading_directions.count: expected at least 1, got {count}.")
-    every = np.zeros((surrogate.body.points.size, len(surrogate.rows)))
-    every[surrogate.rows, np.arange(len(surrogate.rows))] = 1.0
-    whole = surrogate.solve(np.zeros_like(surrogate.body.points)).push(every)
+    inputs, kind = 3 * len(surrogate.maps.loaded), torch.float64 if device == "cpu" else torch.float32
+    module = Linearised(surrogate, np.eye(inputs), kind).to(device).eval().requires_grad_(False)
+    with torch.no_grad(), without_tf32():
+        whole = module(torch.zeros(inputs, dtype=kind, device=device))[1].cpu().double().numpy()
     return np.ascontiguousarray(np.linalg.svd(whole, full_matrices=False)[2][:count].T)
 
 
