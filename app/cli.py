@@ -150,6 +150,30 @@ def export_data(source: Path, output: Path, draws: tuple[int, ...]) -> None:
         click.echo(f"written: {path}")
 
 
+@softtwin.command()
+@click.argument("source", type=_EXISTING)
+@click.argument("output", type=_PATH)
+@click.option(
+    "--precision",
+    type=click.Choice(["single", "double"]),
+    default="single",
+    show_default=True,
+    help="Of the samples; single halves the file.",
+)
+@click.option("--jacobians/--no-jacobians", default=True, show_default=True, help="Take Jacobians along.")
+def tensors(source: Path, output: Path, precision: Any, jacobians: bool) -> None:
+    """Write SOURCE, a data set or a configuration, into one file (OUTPUT.safetensors) for a machine with a GPU.
+
+    Training and prediction read it there with torch, NumPy, SciPy and safetensors alone.
+    """
+    from softtwin.reference.data.tensors import export_tensors
+
+    from .data import opened
+
+    path = export_tensors(opened(source), output, precision, jacobians)
+    click.echo(f"written: {path} ({path.stat().st_size / 2**20:.1f} MiB)")
+
+
 @data_commands.command("merge")
 @click.argument("sources", nargs=-1, required=True, type=_EXISTING)
 @click.argument("output", type=_PATH)
