@@ -10,7 +10,7 @@ flock 9 # two set-ups at once would break each other's virtual environment
 
 PACKAGES=(
     # FEniCSx with PETSc, SLEPc and MPI, and a BLAS that does not make MUMPS 4 times slower
-    python3-dolfinx-real python3-petsc4py-real python3-slepc4py-real python3-mpi4py python3-scipy
+    python3-dolfinx-real python3-petsc4py-real python3-slepc4py-real python3-mpi4py
     libopenblas0-pthread openmpi-bin
     # a virtual environment, and the C compiler and headers that FFCx needs at run time
     python3-venv python3-dev gcc libc6-dev make
@@ -55,28 +55,48 @@ constraints() {
     esac
 }
 
-install_project() {
-    local pins stamp="$VENV/.softtwin-stamp" made="$VENV/.softtwin-way" origin wanted
-    origin="$WAY $("$SYSTEM_PYTHON" -V)"
+# NumPy of the kind (1 or 2) that the FEniCSx of this Python was built for.
+same_numpy() {
+    "$SYSTEM_PYTHON" -c 'import numpy; major = int(numpy.__version__.split(".")[0]); print(f"numpy>={major},<{major + 1}")' 2>/dev/null || true
+}
+
+# install WORDS...: by uv, which is several times as quick and told what pip is told; by pip where there is no uv.
+install() {
+    local pins
     pins=$(constraints)
-    [ "$pins" != /dev/null ] || say "virtual environment: there are no pins for the way $origin, taking the newest versions"
-    wanted=$(fingerprint "$VENV $EXTRAS $origin" pyproject.toml "$pins")
+    if "$VENV/bin/python" -m pip install -q -c "$pins" uv </dev/null 2>/dev/null; then
+        eval "$("$VENV/bin/python" -m pip config list | "$VENV/bin/python" ci/uv_settings.py)"
+        UV_LINK_MODE=${UV_LINK_MODE:-copy} "$VENV/bin/uv" pip install -q --python "$VENV/bin/python" -c "$pins" "$@" </dev/null
+    else
+        say "virtual environment: no uv for this machine, taking pip"
+        "$VENV/bin/python" -m pip install -q -c "$pins" "$@" </dev/null
+    fi
+}
+
+install_project() {
+    local pins stamp="$VENV/.softtwin-stamp" made="$VENV/.softtwin-way" origin wanted beside=()
+    origin="$WAY $("$SYSTEM_PYTHON" -V), isolated"
+    pins=$(constraints)
+    [ "$pins" != /dev/null ] || say "virtual environment: there are no pins for the way $WAY, taking the newest versions"
+    wanted=$(fingerprint "$VENV $EXTRAS $origin" pyproject.toml "$pins" ci/setup.sh ci/let_in.py)
     if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$wanted" ] && "$VENV/bin/python" -c 'import softtwin.meshes' 2>/dev/null; then
         say "virtual environment: .venv is up to date"
         return
     fi
-    # Without its stamp it was cut short, or it was made for another folder or way: pip cannot be trusted to mend that.
+    # Without its stamp it was cut short, or it was made for another folder or way: no installer can be trusted to mend that.
     if [ ! -f "$stamp" ] || [ "$(cat "$made" 2>/dev/null)" != "$origin" ] || ! grep -qsF "$VENV/bin/python" "$VENV/bin/pip" || ! "$VENV/bin/python" -m pip --version >/dev/null 2>&1; then
         say "virtual environment: making .venv"
         rm -rf "$VENV"
-        "$SYSTEM_PYTHON" -m venv "${VENV_OPTIONS[@]}" "$VENV"
+        "$SYSTEM_PYTHON" -m venv "$VENV"
         echo "$origin" >"$made"
     fi
     rm -f "$stamp"
-    say "virtual environment: installing the project and its dependencies (some minutes the first time)"
-    if [ "$WAY" = wheels ]; then announce_torch; fi
-    "$VENV/bin/python" -m pip install -q -c "$pins" --editable ".[$EXTRAS]" </dev/null
+    say "virtual environment: installing the project and its dependencies (a minute the first time)"
+    # FEniCSx that another Python has is let in by name; what it needs beside, the environment has of its own.
+    if [ "$WAY" = wheels ]; then announce_torch; else beside=(cffi "setuptools<80" "$(same_numpy)"); fi
+    install --editable ".[$EXTRAS]" "${beside[@]}"
     rm -rf "$ROOT/softtwin.egg-info" # a by-product: seen from this folder, it makes pkg_resources warn
+    if [ "$WAY" != wheels ]; then "$SYSTEM_PYTHON" ci/let_in.py "$VENV"; fi
     # Before the stamp says that all is well; PyPI's DOLFINx wants its solvers first, which this module knows.
     "$VENV/bin/python" -c 'import torch, softtwin.meshes, softtwin.reference.fem.fenicsx'
     echo "$wanted" >"$stamp"
@@ -93,7 +113,6 @@ link_types() {
 
 WAY=$(setup_way)
 EXTRAS=${SOFTTWIN_EXTRAS:-torch,mesh,app,dev} # what of the project is installed
-VENV_OPTIONS=(--system-site-packages)
 case $WAY in
     apt)
         say "FEniCSx: Debian's packages, by apt"
@@ -102,7 +121,6 @@ case $WAY in
     wheels)
         SYSTEM_PYTHON=$(wheel_python)
         EXTRAS=fenicsx,$EXTRAS
-        VENV_OPTIONS=()
         say "FEniCSx: wheels from PyPI for $SYSTEM_PYTHON"
         check_machine "$SYSTEM_PYTHON"
         ;;
