@@ -81,7 +81,7 @@ def way_of(dolfinx: Path | None, prefix: Path, wheel: bool) -> Way:
 def fenicsx_way() -> Way:
     """The way on which the FEniCSx came that this interpreter sees; it is not loaded for that."""
     found = find_spec("dolfinx")
-    folder = Path(found.origin) if found and found.origin else None
+    folder = Path(found.origin).resolve() if found and found.origin else None  # the environment has a link
     return way_of(folder, Path(sys.base_prefix), _is_installed("dolfinx-solver-real"))
 
 

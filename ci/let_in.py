@@ -2,9 +2,9 @@
 
     /usr/bin/python3 ci/let_in.py .venv
 
-Run by the Python that has them (Debian's, a cluster's). Each package becomes a link in .venv/fenicsx, with the record of
-its version, and one line in a .pth file puts that folder on the environment's path. What they need beside (NumPy, cffi)
-the environment has of its own.
+Run by the Python that has them (Debian's, a cluster's). Each package becomes a link in .venv/fenicsx, with the record
+of its version, and one line in a .pth file puts that folder on the environment's path. What they need beside (NumPy,
+cffi) the environment has of its own.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ COMMAS = ("UV_FIND_LINKS",)  # uv parts the others at spaces
 
 
 def settings(lines: Iterable[str]) -> dict[str, str]:
-    """Variables for uv from the lines of `pip config list`; of one setting in several places the last counts, as pip has it.
+    """Variables for uv from the lines of `pip config list`; of a setting in several places the last counts, as for pip.
 
     Args:
         lines: such as `global.index-url='https://...'`; those of the environment begin with `:env:`.
