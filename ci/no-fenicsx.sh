@@ -1,15 +1,31 @@
 #!/usr/bin/env bash
-# In a virtual environment that sees no FEniCSx: the wheel is whole, a machine that only registers (softtwin[register])
-# stays small, every module of the fast path imports, and its tests pass. Argument: where to put pytest's JUnit file.
+# In virtual environments that see no FEniCSx.
+#
+#   ci/no-fenicsx.sh contract [JUNIT]   the wheel is whole; a machine that only registers (softtwin[register]) stays small,
+#                                       imports the fast path, predicts and registers: tests/contract
+#   ci/no-fenicsx.sh suites [JUNIT]     softtwin[torch,mesh,app,onnx] and all tests of meshes, surrogate and registration
 set -euo pipefail
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 cd "$ROOT"
-BARE="$ROOT/.venv-bare"
-JUNIT=${1:-$ROOT/build/ci/no-fenicsx.xml}
+WHAT=${1:-contract}
+[[ $WHAT = contract || $WHAT = suites ]] || fail "no-fenicsx: expected contract or suites, got '$WHAT'"
+BARE="$ROOT/.venv-bare-$WHAT"
+JUNIT=${2:-$ROOT/build/ci/$WHAT.xml}
 STAMP="$BARE/.softtwin-stamp"
 WANTED=$(fingerprint "$BARE $("$SYSTEM_PYTHON" -V)" pyproject.toml ci/constraints.txt ci/no-fenicsx.sh)
-
 MOST_BYTES=1500000000 # of a machine that only registers, where torch is the build for the CPU
+
+# install PINS WORDS...: into the bare environment, by the uv of the other one.
+install() {
+    local pins=$1
+    shift
+    eval "$("$VENV/bin/python" -m pip config list | "$VENV/bin/python" ci/uv_settings.py)"
+    if [ -x "$VENV/bin/uv" ]; then
+        UV_LINK_MODE=${UV_LINK_MODE:-copy} "$VENV/bin/uv" pip install -q --python "$BARE/bin/python" -c "$pins" "$@"
+    else
+        "$BARE/bin/python" -m pip install -q --no-compile -c "$pins" "$@"
+    fi
+}
 
 # As installed: what Python compiles and writes down in use, unless PYTHONDONTWRITEBYTECODE is set, adds 70 MB.
 check_size() {
@@ -33,22 +49,30 @@ WHEEL=$(echo build/wheel/softtwin-*.whl)
 "$VENV/bin/python" ci/check_wheel.py "$WHEEL"
 
 if [ ! -f "$STAMP" ] || [ "$(cat "$STAMP")" != "$WANTED" ]; then
-    say "making .venv-bare: pip install --no-compile 'softtwin[register]' without the system's packages"
     rm -rf "$BARE"
     "$SYSTEM_PYTHON" -m venv "$BARE"
-    # All pins but VTK's: register asks for a smaller one.
-    "$BARE/bin/python" -m pip install -q --no-compile -c <(grep -v '^vtk==' ci/constraints.txt) "$WHEEL[register]"
-    check_size
-    (cd / && "$BARE/bin/python" "$ROOT/ci/import_fast_path.py" --register)
-    "$BARE/bin/python" -m pip install -q -c ci/constraints.txt "$WHEEL[torch,mesh,app,onnx,test]"
+    if [ "$WHAT" = contract ]; then
+        say "making ${BARE##*/}: softtwin[register] without the system's packages"
+        grep -v '^vtk==' ci/constraints.txt >build/wheel/pins.txt # register asks for a smaller VTK
+        install build/wheel/pins.txt "$WHEEL[register]"
+        check_size
+        install build/wheel/pins.txt pytest
+    else
+        say "making ${BARE##*/}: softtwin[torch,mesh,app,onnx] without the system's packages"
+        install ci/constraints.txt "$WHEEL[torch,mesh,app,onnx,test]"
+    fi
     echo "$WANTED" >"$STAMP"
 fi
 "$BARE/bin/python" -m pip install -q --no-deps --force-reinstall "$WHEEL"
 "$BARE/bin/python" -m pip check
-(cd / && "$BARE/bin/python" "$ROOT/ci/import_fast_path.py")
 mkdir -p "$(dirname "$JUNIT")"
-mapfile -t FOLDERS < <(find tests/meshes tests/surrogate tests/registration -name 'test_*.py' -printf '%h\n' 2>/dev/null | sort -u)
-[ ${#FOLDERS[@]} != 0 ] || fail "no tests in tests/meshes, tests/surrogate, tests/registration"
-"$BARE/bin/pytest" -q -m "not fenicsx and not mpi and not liver" -o junit_family=xunit1 -o cache_dir="$BARE/.pytest_cache" \
-    --junitxml="$JUNIT" "${FOLDERS[@]}"
+if [ "$WHAT" = contract ]; then
+    (cd / && "$BARE/bin/python" "$ROOT/ci/import_fast_path.py" --register)
+    "$BARE/bin/python" -m pytest -q -o junit_family=xunit1 -o cache_dir="$BARE/.pytest_cache" --junitxml="$JUNIT" tests/contract
+else
+    (cd / && "$BARE/bin/python" "$ROOT/ci/import_fast_path.py")
+    "$BARE/bin/python" -m pytest -q -n "${SOFTTWIN_TEST_WORKERS:-2}" --dist worksteal -m "not fenicsx and not mpi and not liver" \
+        -o junit_family=xunit1 -o cache_dir="$BARE/.pytest_cache" --junitxml="$JUNIT" \
+        tests/contract tests/meshes tests/surrogate tests/registration
+fi
 "$BARE/bin/python" ci/tally.py "$JUNIT"

@@ -9,18 +9,16 @@ TEMPORARY=$(mktemp -d)
 trap 'rm -rf "$TEMPORARY"' EXIT
 PINS="$TEMPORARY/pins.txt"
 
-# What is not free: Debian's modules are built for numpy 1.x, and scipy is Debian's own.
-printf '%s\n' torch==2.13.0 numpy==1.26.4 scipy==1.10.1 >"$PINS"
+# What is not free: Debian's modules are built for numpy 1.x, and its ufl imports pkg_resources.
+printf '%s\n' torch==2.13.0 numpy==1.26.4 setuptools==79.0.1 >"$PINS"
 
 # frozen PYTHON: what pip put there, as pins without local version labels (2.13.0+cpu) and without the project.
 frozen() { "$1" -m pip freeze --all --local --exclude-editable | grep -E "^[A-Za-z0-9._-]+==" | grep -v "^pip==" | sed "s/+.*//"; }
 
-resolve() { # EXTRAS PYTHON_OPTIONS...: adds to the pins what a virtual environment with the extras holds
-    local extras=$1
-    shift
+resolve() { # EXTRAS: adds to the pins what a virtual environment with the extras holds
     rm -rf "$TEMPORARY/venv"
-    "$SYSTEM_PYTHON" -m venv "$@" "$TEMPORARY/venv"
-    "$TEMPORARY/venv/bin/python" -m pip install -q -c "$PINS" --editable ".[$extras]"
+    "$SYSTEM_PYTHON" -m venv "$TEMPORARY/venv"
+    "$TEMPORARY/venv/bin/python" -m pip install -q -c "$PINS" --editable ".[$1]" uv cffi setuptools
     { cat "$PINS"; frozen "$TEMPORARY/venv/bin/python"; } | sort -fu >"$TEMPORARY/more.txt"
     mv "$TEMPORARY/more.txt" "$PINS"
 }
@@ -30,9 +28,8 @@ write() { # FILE SOURCE PYTHON: the pins under two lines that say what they are
     say "$1: $(wc -l <"$2") pins"
 }
 
-resolve torch,mesh,app,dev,benchmark --system-site-packages
-echo torch-fem==0.14.0 >>"$PINS" # asks for a newer scipy than Debian's: installed without its dependencies
-resolve torch,mesh,app,test
+resolve torch,mesh,app,dev,benchmark
+echo torch-fem==0.14.0 >>"$PINS" # installed without its dependencies
 write ci/constraints.txt "$PINS" 3.11
 SECOND_PYTHON=$(second_python)
 if [ -n "$SECOND_PYTHON" ]; then
