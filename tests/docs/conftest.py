@@ -23,7 +23,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 
 # Programs whose words nothing here can take, and why that is left.
 UNTRIED = {
-    "apt-get": "packages of a system: ci/setup.sh and ci/debian13.sh install those of Debian",
+    "apt-get": "packages of a system: ci/setup.sh and ci/bare_debian.sh install those of Debian",
     "dnf": "packages of a system that no test has",
     "conda": "no channel of conda can be reached from where tests run",
     "export": "sets a variable, whose value is the reader's",
