@@ -19,27 +19,32 @@ PACKAGES=(
     libxrender1 libfontconfig1 libgomp1
 )
 
-missing_packages() {
+# missing NAME...: those of the packages that are not installed.
+missing() {
     local installed
-    installed=$(dpkg-query -W -f='${Package} ${db:Status-Status}\n' "${PACKAGES[@]}" 2>/dev/null | awk '$2 == "installed" { print $1 }') || true
-    comm -23 <(printf '%s\n' "${PACKAGES[@]}" | sort) <(printf '%s\n' "$installed" | sort)
+    installed=$(dpkg-query -W -f='${Package} ${db:Status-Status}\n' "$@" 2>/dev/null | awk '$2 == "installed" { print $1 }') || true
+    comm -23 <(printf '%s\n' "$@" | sort) <(printf '%s\n' "$installed" | sort)
 }
 
+# install_packages NAME...: by apt, those that are missing.
 install_packages() {
     local wanted
-    mapfile -t wanted < <(missing_packages)
+    mapfile -t wanted < <(missing "$@")
     if [ ${#wanted[@]} = 0 ]; then
-        say "system packages: all ${#PACKAGES[@]} are there"
+        say "system packages: all $# are there"
         return
     fi
-    say "system packages: ${#wanted[@]} of ${#PACKAGES[@]} are missing: ${wanted[*]}"
+    say "system packages: ${#wanted[@]} of $# are missing: ${wanted[*]}"
     if [ "$(id -u)" != 0 ] && ! command -v sudo >/dev/null; then
         fail "they need root. Run as root, or ask for: apt-get install ${wanted[*]}"
     fi
     local lock=(-o DPkg::Lock::Timeout=600)
     # An installation that was cut short leaves packages half configured, and apt-get would stop there.
     if [ -n "$(dpkg --audit 2>/dev/null)" ]; then as_root dpkg --configure -a </dev/null; fi
-    as_root apt-get "${lock[@]}" -q update </dev/null || fail "apt-get update did not work; wanted: ${wanted[*]}"
+    if [ -z "${LISTS_ARE_NEW:-}" ]; then
+        as_root apt-get "${lock[@]}" -q update </dev/null || fail "apt-get update did not work; wanted: ${wanted[*]}"
+        LISTS_ARE_NEW=1
+    fi
     as_root apt-get "${lock[@]}" -q install -y --no-install-recommends "${wanted[@]}" </dev/null ||
         fail "apt-get could not install: ${wanted[*]}"
 }
@@ -96,6 +101,7 @@ install_project() {
     if [ "$WAY" = wheels ]; then announce_torch; else beside=(cffi "setuptools<80" "$(same_numpy)"); fi
     install --editable ".[$EXTRAS]" "${beside[@]}"
     rm -rf "$ROOT/softtwin.egg-info" # a by-product: seen from this folder, it makes pkg_resources warn
+    if [ -n "$BEHIND" ]; then wait_for_packages; fi
     if [ "$WAY" != wheels ]; then "$SYSTEM_PYTHON" ci/let_in.py "$VENV"; fi
     # Before the stamp says that all is well; PyPI's DOLFINx wants its solvers first, which this module knows.
     "$VENV/bin/python" -c 'import torch, softtwin.meshes, softtwin.reference.fem.fenicsx'
@@ -111,12 +117,31 @@ link_types() {
     done
 }
 
+# wait_for_packages: until those of the system are there; what apt said is shown where it failed.
+wait_for_packages() {
+    if ! wait "$BEHIND"; then
+        cat "$ROOT/build/apt.log" >&2
+        fail "the system's packages could not be installed"
+    fi
+    grep -h '^\[softtwin\]' "$ROOT/build/apt.log" || true
+    BEHIND=""
+}
+
 WAY=$(setup_way)
 EXTRAS=${SOFTTWIN_EXTRAS:-torch,mesh,app,dev} # what of the project is installed
+BEHIND="" # the process that installs system packages meanwhile
 case $WAY in
     apt)
         say "FEniCSx: Debian's packages, by apt"
-        install_packages
+        install_packages python3-venv python3-dev gcc libc6-dev # crcmod of pyigtl is compiled
+        # dpkg and the installer of Python's packages keep a core busy each. Without pins the second has to see the first's NumPy.
+        if [ "$(constraints)" != /dev/null ]; then
+            mkdir -p "$ROOT/build"
+            install_packages "${PACKAGES[@]}" >"$ROOT/build/apt.log" 2>&1 &
+            BEHIND=$!
+        else
+            install_packages "${PACKAGES[@]}"
+        fi
         ;;
     wheels)
         SYSTEM_PYTHON=$(wheel_python)
@@ -130,5 +155,6 @@ case $WAY in
         ;;
 esac
 install_project
+[ -z "$BEHIND" ] || wait_for_packages
 link_types
 say "ready: .venv/bin/softtwin --help"
