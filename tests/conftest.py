@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")  # before NumPy is imported: two workers have two cores, and programs inherit it
+    os.environ.setdefault(variable, "1")  # before NumPy is imported; programs that tests start inherit it
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does: else tests on busy cores crawl
 
 import numpy as np
@@ -24,6 +24,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 
 LIVER = Path(__file__).parents[2] / "shared" / "data" / "liver"
+
 
 @pytest.fixture(scope="session")
 def hexahedral_beam() -> Body:
