@@ -5,20 +5,25 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")  # before NumPy is imported; programs that tests start inherit it
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does: else tests on busy cores crawl
 
 import numpy as np
 import pytest
+
+for folder in ("benchmarks", "examples", "tests"):
+    sys.path.insert(0, str(Path(__file__).parents[1] / folder))
+
+from shared_twins import built_once, unchanged
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 
 LIVER = Path(__file__).parents[2] / "shared" / "data" / "liver"
-
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does: else tests on busy cores crawl
-
-for folder in ("benchmarks", "examples", "tests"):
-    sys.path.insert(0, str(Path(__file__).parents[1] / folder))
 
 
 @pytest.fixture(scope="session")
@@ -53,17 +58,20 @@ def mpi_environment() -> dict[str, str]:
 
 
 @pytest.fixture(scope="session")
-def small_quickstart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_quickstart() -> Iterator[Path]:
     """A finished small quickstart, run as a user runs it; who changes it takes a copy."""
     pytest.importorskip("petsc4py", reason="FEniCSx is absent")
     pytest.importorskip("torch", reason="torch is absent")
-    folder = tmp_path_factory.mktemp("quickstart") / "out"
-    command = [sys.executable, "-m", "softtwin.app.cli", "quickstart", "--small", "--output", str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    with unchanged(built_once("quickstart", _run_quickstart, __file__)) as folder:
+        yield folder / "out"
+
+
+def _run_quickstart(place: Path) -> None:
+    command = [sys.executable, "-m", "softtwin.app.cli", "quickstart", "--small", "--output", "out"]
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    (folder / "said.txt").write_text(done.stdout)
-    (folder / "complained.txt").write_text(done.stderr)
-    return folder
+    (place / "out" / "said.txt").write_text(done.stdout)
+    (place / "out" / "complained.txt").write_text(done.stderr)
 
 
 @pytest.fixture

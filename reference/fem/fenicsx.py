@@ -110,7 +110,7 @@ def _cache_directory() -> Path:
 
 @contextlib.contextmanager
 def _compiling(cache: Path) -> Iterator[None]:
-    """One compiling process at a time; what an earlier one left half-made when it was killed is removed.
+    """One process at a time compiles a form; what an earlier one left half-made when it was killed is removed.
 
     FFCx's own lock is a file that survives a kill: every later run would wait for it and fail.
     """
@@ -256,8 +256,11 @@ def constant(domain: Any, value: float) -> Any:
 
 
 def form(expression: Any) -> Any:
-    """Compile a UFL form with optimisation, in a cache of this processor's own."""
-    cache = _cache_directory()
+    """Compile a UFL form with optimisation, in a cache of this processor's own.
+
+    Each form has a folder and a lock there: who loads a form that is compiled waits for no compiler of another one.
+    """
+    cache = _cache_directory() / hashlib.sha256(expression.signature().encode()).hexdigest()[:24]
     jit = {
         "cffi_extra_compile_args": _COMPILE,
         "cffi_libraries": _LINK,

@@ -81,6 +81,7 @@ def test_a_surrogate_has_them_beside_its_own(quickstart: Path) -> None:
     np.testing.assert_allclose(both.rest, np.hypot(own.rest, further.rest))
 
 
+@pytest.mark.mpi
 def test_ranks_draw_the_same(quickstart: Path, mpi_environment: dict[str, str]) -> None:
     file, body = quickstart / "organ.toml", read_body(quickstart / "body.vtu")
     before, _ = read_discrepancy(quickstart / "twin" / DOUBT, body)

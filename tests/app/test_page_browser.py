@@ -21,6 +21,7 @@ if not CHROMIUM.exists():
         "no chromium here (apt-get install chromium): the page was tried in no browser", allow_module_level=True
     )
 
+pytestmark = pytest.mark.browser
 NAMED = (  # what the console may say, all of it from the library's own page
     "Unable to preventDefault inside passive event listener invocation",
     "GPU stall due to ReadPixels",  # of taking screenshots

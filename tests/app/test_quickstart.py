@@ -39,7 +39,7 @@ def copy(made: Path, tmp_path: Path) -> Path:
 def test_it_says_what_it_does_and_complains_of_nothing(made: Path) -> None:
     said, complained = (made / "said.txt").read_text(), (made / "complained.txt").read_text()
     assert "not a medical device" in said
-    assert said.strip().splitlines()[-1] == f"open {made / 'report.html'}"
+    assert said.strip().splitlines()[-1] == "open out/report.html"
     assert "Traceback" not in complained and "Warning" not in complained, complained
 
 

@@ -42,6 +42,7 @@ ENTRIES = {
     "loads": {"modes": 4, "displacement": 0.05},
     "samples": {"train": 6, "validation": 2, "test": 2, "block": 2, "ranks": 1},
     "training": {"modes": 4, "width": 16, "seconds": 0.5},
+    "doubt": {"draws": 12},
 }
 
 

@@ -89,6 +89,7 @@ def served(folder: Path) -> Iterator[str]:
         thread.join()
 
 
+@pytest.mark.browser
 def test_a_browser_asks_nobody_else_and_finds_what_is_searched_for(site: Path) -> None:
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is absent")
     browser_path = shutil.which("chromium")

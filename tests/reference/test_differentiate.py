@@ -85,6 +85,7 @@ def test_they_are_the_derivatives_of_the_equilibria(done: Path, modes: np.ndarra
     assert found.squares[0] == pytest.approx(np.square(columns).sum())
 
 
+@pytest.mark.mpi
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="mpirun is absent")
 def test_two_ranks_make_the_same(data: DataSet, modes: np.ndarray, done: Path, tmp_path: Path, mpi_environment) -> None:
     path = tmp_path / "data.zarr"

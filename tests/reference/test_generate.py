@@ -117,7 +117,7 @@ def test_splits_share_no_draw(undisturbed: DataSet, one: Split, other: Split) ->
 
 @pytest.mark.mpi
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="mpirun is absent")
-@pytest.mark.parametrize("ranks", [2, 3])
+@pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_ranks_do_not_change_the_data(
     undisturbed: DataSet, tmp_path: Path, mpi_environment: dict[str, str], ranks: int
 ) -> None:
@@ -258,6 +258,7 @@ def test_two_do_not_write_one_data_set(undisturbed: DataSet, tmp_path: Path, mon
 # ---------------------------------------------------------------------- parts
 
 
+@pytest.mark.mpi
 def test_parts_that_know_nothing_of_each_other_make_the_same_data(
     undisturbed: DataSet, tmp_path: Path, mpi_environment: dict[str, str]
 ) -> None:
