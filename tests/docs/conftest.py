@@ -125,7 +125,7 @@ class CommandLines:
         mkdocs.main(args=words, standalone_mode=False)
 
     def _make(self, words: list[str]) -> None:
-        targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.M)
+        targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.M)
         assert words and set(words) <= set(targets), f"targets of the Makefile are {targets}, got {words}"
 
     def _bash(self, words: list[str]) -> None:
