@@ -1,4 +1,4 @@
-"""What the reference solver is checked against, at full size, written as docs/verification.md.
+"""What the reference solver is checked against, at full size, written as docs/archive/verification.md.
 
 python benchmarks/verification.py [--only closed patch manufactured tangent taylor cook locking | --recorded]
 """
@@ -391,7 +391,7 @@ the finest mixed solution (Q2-Q1, {first["finest"]} cells across): {best}.
 P1 and Q1 lock, at 0.4999 beyond use; P2 and Q2 are slower than their mixed forms, which do not feel Poisson's ratio.
 
 {table(["", "element", *(f"{n} across" for n in first["divisions"])], rows)}
-![Deflection of each element by mesh](verification-locking.png)
+![Deflection of each element by mesh](../verification-locking.png)
 """
 
 
@@ -455,7 +455,7 @@ def main() -> None:
 
 
 def write_page(sections: list[str]) -> None:
-    (DOCS / "verification.md").write_text("\n".join([INTRODUCTION, *sections, *recorded_pages()]))
+    (DOCS / "archive" / "verification.md").write_text("\n".join([INTRODUCTION, *sections, *recorded_pages()]))
 
 
 if __name__ == "__main__":

@@ -73,3 +73,29 @@ def test_figures_with_decimals_stand_in_the_results(page: str) -> None:
     quoted = set(re.findall(r"(?<![\d.])(\d+\.\d+)(?= mm| %| \(asked| where)", text))
     assert len(quoted) >= 2
     assert [figure for figure in sorted(quoted) if figure not in RESULTS] == []
+
+
+def test_verification_quotes_figures_of_the_tables_that_its_script_writes() -> None:
+    """Numbers with a decimal point or an exponent, of the tables' cells."""
+    page, tables = ((DOCS / name).read_text() for name in ("verification.md", "archive/verification.md"))
+    cells = [cell for line in page.splitlines() if line.startswith("|") for cell in line.split("|")]
+    quoted = {figure for cell in cells for figure in re.findall(r"\d+\.\d+(?:e-\d+)?", cell)}
+    assert len(quoted) >= 60
+    assert sorted(figure for figure in quoted if figure not in tables) == []
+
+
+def test_verification_names_the_widest_of_the_orders() -> None:
+    """The ranges of the summary are those of the archive's table of manufactured solutions."""
+    tables = (DOCS / "archive" / "verification.md").read_text()
+    rows = [row.split("|") for row in tables.split("## Manufactured solutions")[1].split("\n## ")[0].splitlines()]
+    rows = [row for row in rows if len(row) == 7 and "e-" in row[3]]
+    assert len(rows) == 56
+    summary = (DOCS / "verification.md").read_text()
+    for name, of in {
+        "linear": [row for row in rows if "incompressible" not in row[1] and row[1].rstrip()[-1] not in "0679"],
+        "quadratic": [row for row in rows if "incompressible" not in row[1] and row[1].rstrip()[-1] in "0679"],
+        "mixed": [row for row in rows if "incompressible" in row[1]],
+    }.items():
+        orders = [sorted(float(row[place].split(";")[1]) for row in of) for place in (3, 4)]
+        found = "; ".join(f"{each[0]:.2f} to {each[-1]:.2f}" for each in orders)
+        assert re.search(rf"^\| manufactured solutions, {name} elements \|.*\| {found}", summary, flags=re.M), found
