@@ -97,6 +97,18 @@ def test_files_that_are_named_are_there(page: str) -> None:
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
+def test_links_outside_the_site_lead_to_files_and_headings(page: str) -> None:
+    """Mkdocs checks those of docs/."""
+    links = re.findall(r"\]\(([^)#:]+)(?:#([^)]+))?\)", (ROOT / page).read_text())
+    for name, anchor in links:
+        assert (ROOT / name).is_file(), name
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", (ROOT / name).read_text(), flags=re.M)
+            assert anchor in [re.sub(r"[^\w-]+", "-", heading.lower()).strip("-") for heading in headings], anchor
+    assert page != "README.md" or len(links) >= 15
+
+
 @pytest.mark.parametrize(
     "words", ["softtwin register", "softtwin build a.stl --fixed ball:1,2:3mm", "softtwin nothing"]
 )
