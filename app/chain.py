@@ -18,8 +18,9 @@ from .launch import doubt_in_parallel, generate_in_parallel
 from .register import NOTICE
 from .stages.doubt import is_current
 from .stages.generate import describe_data, lacks_jacobians
-from .stages.learn import train_stage, training_plan, validate_stage
+from .stages.learn import train_stage, validate_stage
 from .stages.mesh import mesh_stage
+from .stages.plan import training_plan
 from .twin import DOUBT
 from .workspace import Workspace, open_workspace, write_whole
 

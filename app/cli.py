@@ -340,9 +340,9 @@ def register(
 
     TWIN is a twin's folder; with --model reference a folder with a body and its configuration is enough.
     """
+    from .address import SCHEME, parse_source
     from .export import FORMATS
     from .register import Start, register_files
-    from .sources import SCHEME, parse_source
 
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
@@ -688,9 +688,9 @@ def live(
     SOURCE is a folder that is written to, or a place of OpenIGTLink (igtl://HOST:PORT, igtl://:PORT to listen; mm and
     RAS if not given). Nothing is written or sent back; `softtwin register --watch` does that.
     """
+    from .address import parse_source
     from .page.stream import run_live
     from .register import Start
-    from .sources import parse_source
 
     if sum(given is not None for given in (matrix, landmarks or None, align)) > 1:
         raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")

@@ -42,7 +42,8 @@ from softtwin.registration.verdict import Judgement, Verdict
 
 from .config import Config, ConfigError, RegistrationSection, files_axes, parse_config
 from .inputs import check_material, load_plan
-from .unknowns import Scenario, UnknownError
+from .scenario import Scenario
+from .unknowns import UnknownError
 from .workspace import open_workspace
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from softtwin.surrogate.twin import CARD, load, save
 
 from ..config import Config
 from ..workspace import Workspace
-from .learn import training_plan
+from .plan import training_plan
 
 Floats = NDArray[np.float64]
 _SHARE = 0.25  # of the time to train in the end that a round's network is given
