@@ -153,7 +153,9 @@ def watch_source(
     start = start or Start()
     marks = scene.marks(start)
     if marks is not None and isinstance(source, Address):
-        raise ConfigError(f"--marks: expected clouds in files, which marks go with by their names, got {source}.")
+        raise ConfigError(
+            f"--frame-landmarks: expected clouds in files, which marks go with by their names, got {source}."
+        )
     with scene.opened(start, say) as (twin, camera):
         say_coordinates(twin, say)
         twin.registrar()  # prepared before the first cloud is waited for

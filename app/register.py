@@ -27,10 +27,10 @@ from . import twin as twins
 from .config import ConfigError
 from .export import WRITTEN, Exporter
 from .landmarks import MarkFiles, camera_from_landmarks, describe_landmarks
+from .parameters import priors_taken
 from .record import NOTICE as NOTICE
 from .record import Recorder, counts, describe, notes_on
 from .twin import Camera, Frame, Twin, coordinates_of
-from .unknowns import priors_taken
 
 Floats = NDArray[np.float64]
 CLOUDS = (".npy", ".txt", ".csv", ".xyz", ".ply", ".stl", ".obj", ".vtk", ".vtp", ".vtu", ".pcd")
@@ -290,7 +290,7 @@ class Scene:
             ConfigError, FileError, PoseError, TwinError: what cannot be used, and why.
         """
         section = twins.with_options(self.home.config, dict(self.options)).registration
-        for line in priors_taken(section.unknowns) if section.forces == "unknown" else ():
+        for line in priors_taken(section.parameters) if section.forces == "unknown" else ():
             say(line)
         pose = None
         if start.matrix is not None:

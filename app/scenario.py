@@ -1,4 +1,4 @@
-"""What is unknown beside the forces of a twin, and which known loads act on it, from the configuration."""
+"""Parameters to estimate beside the forces of a twin, and known loads that act on it, from the configuration."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from softtwin.registration.conditions import Conditions
 from softtwin.registration.contact import Patch
 
 from .config import Config
-from .unknowns import Unknown, UnknownError
+from .parameters import NamedParameter, ParameterError
 
 Floats = NDArray[np.float64]
 
@@ -25,14 +25,14 @@ class Scenario:
     """What is unknown beside the forces of a twin, and what is known to act along.
 
     Args:
-        unknowns: beside the forces.
+        parameters: to estimate beside the forces.
         forces: file of known nodal forces, .npy (n, 3), newtons, on the axes of the twin's files; None for none.
         gravity: on the axes of the twin's files, (3,), m/s^2.
         pressure: on the whole boundary, pascals.
         density: kg/m^3.
     """
 
-    unknowns: tuple[Unknown, ...]
+    parameters: tuple[NamedParameter, ...]
     forces: Path | None
     gravity: tuple[float, float, float]
     pressure: float
@@ -43,7 +43,7 @@ class Scenario:
         """What a configuration says."""
         section = config.registration
         return cls(
-            tuple(map(Unknown.parse, section.unknowns)),
+            tuple(map(NamedParameter.parse, section.parameters)),
             Path(section.known_forces) if section.known_forces else None,
             section.gravity,
             section.pressure,
@@ -53,20 +53,20 @@ class Scenario:
     @property
     def patch(self) -> Patch | None:
         """The one contact of unknown place; None where forces act anywhere."""
-        contacts = [unknown for unknown in self.unknowns if unknown.kind == "contact"]
+        contacts = [named for named in self.parameters if named.kind == "contact"]
         if not contacts:
             return None
         return Patch() if contacts[0].number is None else Patch(contacts[0].number)
 
     def modulus(self, modulus: float, body: Body) -> float | Floats:
         """Young's modulus as the material needs it: one for each cell where that of a region is unknown, pascals."""
-        by_region = any(unknown.kind == "young-modulus" and unknown.place for unknown in self.unknowns)
+        by_region = any(named.kind == "young-modulus" and named.place for named in self.parameters)
         return np.full(len(body.cells), modulus) if by_region else modulus
 
     @property
     def held(self) -> dict[str, str]:
         """Axes that are held at each node set."""
-        moved = [unknown.place for unknown in self.unknowns if unknown.kind == "moved"]
+        moved = [named.place for named in self.parameters if named.kind == "moved"]
         return {"fixed": "xyz", **dict.fromkeys(moved, "xyz")}
 
     def loading(self, body: Body, coordinates: Coordinates) -> Loading:
@@ -77,7 +77,7 @@ class Scenario:
             coordinates: of the twin's files.
 
         Raises:
-            UnknownError: no such file, or forces of another body.
+            ParameterError: no such file, or forces of another body.
         """
         weight = coordinates.directions(np.array(self.gravity)) * self.density if any(self.gravity) else None
         pressure = {"boundary": self.pressure} if self.pressure else {}
@@ -89,21 +89,23 @@ class Scenario:
         try:
             found = np.asarray(np.load(self.forces, allow_pickle=False), dtype=np.float64)
         except (OSError, ValueError, EOFError) as error:
-            raise UnknownError(f"known forces: expected an array in {self.forces} ({error}).") from None
+            raise ParameterError(f"known forces: expected an array in {self.forces} ({error}).") from None
         if found.shape != body.points.shape or not np.isfinite(found).all():
-            raise UnknownError(
+            raise ParameterError(
                 f"known forces: expected finite numbers of shape {body.points.shape}, newtons, got shape {found.shape} "
                 f"in {self.forces}."
             )
         found = coordinates.directions(found)
         lost = np.abs(found[body.fixed]).sum()
         if lost > 1e-9 * np.abs(found).sum():
-            raise UnknownError(f"known forces: expected none at fixed nodes, got {lost:.3g} N there in {self.forces}.")
+            raise ParameterError(
+                f"known forces: expected none at fixed nodes, got {lost:.3g} N there in {self.forces}."
+            )
         found[body.fixed] = 0.0
         return found
 
     def conditions(self, body: Body, modulus: float, ratio: float) -> Conditions | None:
-        """The unknowns as registration takes them; None where there are none.
+        """The parameters as registration takes them; None where there are none.
 
         Args:
             body: the body.
@@ -113,8 +115,8 @@ class Scenario:
         Raises:
             ValueError: no such structure or node set, or each named twice.
         """
-        named = [unknown for unknown in self.unknowns if unknown.kind != "contact"]
+        named = [parameter for parameter in self.parameters if parameter.kind != "contact"]
         if not named:
             return None
-        parameters = {"young_modulus": self.modulus(modulus, body), "poisson_ratio": ratio}
-        return Conditions(body, parameters, tuple(unknown.condition(body) for unknown in named))
+        values = {"young_modulus": self.modulus(modulus, body), "poisson_ratio": ratio}
+        return Conditions(body, values, tuple(parameter.condition(body) for parameter in named))

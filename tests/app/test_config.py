@@ -36,7 +36,7 @@ def test_every_entry_says_what_it_means() -> None:
         ({"body": {"unit": "inch"}}, r"body\.unit: .*'m', 'cm' or 'mm', got 'inch'"),
         ({"samples": {"train": 0}}, r"samples\.train: .*greater than or equal to 1, got 0"),
         ({"loads": {"radius": [0.5, 0.1]}}, r"\n  loads\.radius: expected smallest <= largest, got \(0\.5, 0\.1\)$"),
-        ({"samples": {"ramp": 3}}, r"\n  samples\.ramp: expected a divisor of samples\.block \(8\), got 3$"),
+        ({"samples": {"load_path": 3}}, r"\n  samples\.ramp: expected a divisor of samples\.block \(8\), got 3$"),
         ({"samples": {"seed": "x" * 999}}, r"samples\.seed: .*, got 'x+\.\.\.x+'$"),
         ({"body": {"source": "a.ply"}, "loads": {"modes": 3001}}, r"\n  loads\.modes: expected at most 3000 with body"),
     ],
@@ -61,4 +61,4 @@ def test_missing_files_and_broken_toml_are_named(tmp_path: Path) -> None:
 
 def test_an_entry_under_its_older_name_is_read() -> None:
     config = parse_config({"samples": {"path": 4}})
-    assert config.samples.ramp == 4 and "ramp = 4" in to_toml(config) and "path =" not in to_toml(config)
+    assert config.samples.load_path == 4 and "ramp = 4" in to_toml(config) and "path =" not in to_toml(config)

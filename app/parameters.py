@@ -1,4 +1,4 @@
-"""Unknowns beside the forces, and known loads, as the configuration and the command line name them."""
+"""Parameters to estimate beside the forces, as the configuration and the command line name them."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _MODULUS = "young-modulus"
 _PLACED = {_MODULUS: "maybe", "poisson-ratio": "never", "moved": "always", "contact": "never"}
 
 
-class UnknownError(ValueError):
-    """An unknown that nothing is known by that name, or that does not go with the others."""
+class ParameterError(ValueError):
+    """A parameter of no known name, or one that does not go with the others."""
 
 
 @dataclass(frozen=True)
-class Unknown:
-    """One unknown as it is named.
+class NamedParameter:
+    """One parameter as it is named.
 
     Args:
         kind: `young-modulus`, `poisson-ratio`, `moved` or `contact`.
@@ -43,19 +43,19 @@ class Unknown:
     number: float | None = None
 
     @classmethod
-    def parse(cls, text: str) -> Unknown:
-        """The unknown that words stand for.
+    def parse(cls, text: str) -> NamedParameter:
+        """The parameter that words stand for.
 
         Raises:
-            UnknownError: no such words, a place where there is none, or none where there is one, no positive number.
+            ParameterError: no such words, a place where there is none, or none where there is one, no positive number.
         """
         found = _WORD.fullmatch(text.strip())
         kind = found["kind"] if found else ""
         if found is None or kind not in _PLACED:
-            raise UnknownError(f"expected {WORDS}, got {text!r}")
+            raise ParameterError(f"expected {WORDS}, got {text!r}")
         placed = bool(found["place"])
         if (placed and _PLACED[kind] == "never") or (not placed and _PLACED[kind] == "always"):
-            raise UnknownError(f"expected {'moved@NODES' if kind == 'moved' else kind}, got {text!r}")
+            raise ParameterError(f"expected {'moved@NODES' if kind == 'moved' else kind}, got {text!r}")
         return cls(kind, found["place"] or "", _positive(found["number"], text))
 
     def condition(self, body: Body) -> Condition:
@@ -72,13 +72,15 @@ class Unknown:
         return Moved(self.place) if self.number is None else Moved(self.place, shift=self.number)
 
 
-def priors_taken(unknowns: tuple[str, ...]) -> list[str]:
+def priors_taken(parameters: tuple[str, ...]) -> list[str]:
     """A line for each modulus whose prior nobody has said: beside unknown forces it is what newtons are worth.
 
     Args:
-        unknowns: words, as `Unknown.parse` takes them.
+        parameters: words, as `NamedParameter.parse` takes them.
     """
-    silent = [text for text in unknowns if (named := Unknown.parse(text)).number is None and named.kind == _MODULUS]
+    silent = [
+        text for text in parameters if (named := NamedParameter.parse(text)).number is None and named.kind == _MODULUS
+    ]
     taken = f"prior of ±{100 * Stiffness.deviation:.0f} % taken"
     return [f"{text}: {taken}, and forces are known no better; say {text}=DEVIATION" for text in silent]
 
@@ -91,5 +93,5 @@ def _positive(text: str | None, whole: str) -> float | None:
     except ValueError:
         number = np.nan
     if not 0.0 < number < np.inf:
-        raise UnknownError(f"expected a positive number behind =, got {whole!r}")
+        raise ParameterError(f"expected a positive number behind =, got {whole!r}")
     return number
