@@ -67,8 +67,8 @@ class RegisterArguments(Section):
     )
     formats: tuple[str, ...] = option(
         (),
-        "vtu: the organ; stl, ply, obj, vtp: surfaces; nrrd: displacement field; mrk.json: targets; seq.mrb: "
-        "sequences; vtu and vtp if not given",
+        "files of each frame: vtu: the organ; stl, ply, obj, vtp: surfaces; nrrd: displacement field; mrk.json: "
+        "targets; seq.mrb: sequences; vtu and vtp if not given",
         basic=True,
         flag="--format",
     )

@@ -127,7 +127,11 @@ class Command(click.Command):
             for heading, rows in _grouped(param for param in entries if param.entry.is_advanced is advanced):
                 with formatter.section(f"Advanced: {heading}" if advanced else heading.capitalize()):
                     formatter.write_dl([row for param in rows if (row := param.get_help_record(ctx))])
-        others = [param for param in self.get_params(ctx) if not isinstance(param, SchemaFlag)]
+        others = [
+            param
+            for param in self.get_params(ctx)
+            if isinstance(param, click.Option) and not isinstance(param, SchemaFlag)
+        ]
         if rows := [row for param in others if (row := param.get_help_record(ctx))]:
             with formatter.section("Other"):
                 formatter.write_dl(rows)

@@ -268,7 +268,7 @@ def finite(value: Any) -> Any:
 
 
 def describe(row: Mapping[str, Any]) -> str:
-    """One line for a person: the verdict with its first reason, distance, net force with its standard deviation, errors if known."""
+    """One line for a person: the verdict with its first reason, distance, net force, errors if known."""
     line = f"frame {row['frame']:3d}: {row['verdict']}"
     if row["reasons"]:
         line += f" ({row['reasons'][0]})"

@@ -34,7 +34,7 @@ def model_error_stage(configuration: Path) -> str | None:
         What was found, in words, on rank 0; None on the others.
 
     Raises:
-        ConfigError: [model_error] asks for nothing, or most of its perturbed models have no equilibrium; see `current_data`.
+        ConfigError: [model_error] asks for nothing, or most of its models have no equilibrium; see `current_data`.
         DataSetError: the training samples are not complete, or of another body or configuration.
         FailedElsewhere: on the other ranks, where rank 0 raises one of these.
     """
@@ -53,8 +53,9 @@ def model_error_stage(configuration: Path) -> str | None:
     assert found is not None
     if len(found.errors) < _MINIMUM_MODELS:
         raise ConfigError(
-            f"model_error: expected at least {_MINIMUM_MODELS} perturbed models, got {len(found.errors)}; {found.failed} of the draws "
-            "have no equilibrium, or fewer than three nodes hold them; lower model_error.attachment, or ask for more "
+            f"model_error: expected at least {_MINIMUM_MODELS} perturbed models, got {len(found.errors)}; "
+            f"{found.failed} of the draws have no equilibrium, or fewer than three nodes hold them; lower "
+            "model_error.attachment, or ask for more "
             "model_error.draws."
         )
     patterns, _ = discrepancy_of(found.errors, data.body, _MAXIMUM_PATTERNS)
@@ -88,8 +89,8 @@ def describe_model_error(errors: Any, failed: int) -> str:
     lengths = np.linalg.norm(errors.reshape(len(errors), -1, 3), axis=2)
     left = f"; {failed} without an equilibrium are left out" if failed else ""
     return (
-        f"{len(errors)} perturbed models: a node lies {100 * lengths.mean():.1f} % of the largest movement away, the worst "
-        f"node {100 * lengths.max(axis=1).mean():.0f} %{left}"
+        f"{len(errors)} perturbed models: a node lies {100 * lengths.mean():.1f} % of the largest movement away, "
+        f"the worst node {100 * lengths.max(axis=1).mean():.0f} %{left}"
     )
 
 

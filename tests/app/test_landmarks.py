@@ -133,7 +133,9 @@ def test_what_are_no_landmarks_of_the_clouds_is_said_before_the_first(plain_twin
             MarkFiles.read(body, other, METRES, METRES, files)
     with pytest.raises(FileError, match=r"expected landmarks that the body has \(m0, .*\), got tip"):
         MarkFiles.read(body, other, METRES, METRES, clouds[:1])
-    with pytest.raises(ConfigError, match=r"--frame-landmarks: .*expected points on the observed side at rest; point 0 lies"):
+    with pytest.raises(
+        ConfigError, match=r"--frame-landmarks: .*expected points on the observed side at rest; point 0 lies"
+    ):
         MarkFiles({"far": np.ones(3)}, other, METRES).check(plain_twin)
 
 
