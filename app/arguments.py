@@ -72,6 +72,13 @@ class RegisterArguments(Section):
         basic=True,
         flag="--format",
     )
+    budget: float | None = option(
+        None,
+        "time for a frame, after which the best so far is taken; no limit if neither given nor in organ.toml",
+        unit="seconds",
+        group="solver",
+        gt=0.0,
+    )
     strict: bool = option(False, "end with code 3 unless every frame is accepted")
     output: Path = option(Path("registration"), "folder of the results", basic=True)
 

@@ -224,7 +224,7 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
 @click.argument("clouds", nargs=-1, required=True)
 @flags(CloudArguments)
 @flags(StartArguments)
-@flags(RegistrationSection, without=("forces",), unset=True)
+@flags(RegistrationSection, without=("forces", "budget"), unset=True)
 @flags(WatchArguments)
 @flags(RegisterArguments)
 def register(
@@ -238,6 +238,7 @@ def register(
     frame_landmarks: tuple[Path, Path] | None,
     formats: tuple[str, ...],
     truth: Path | None,
+    budget: float | None,
     watch: bool,
     idle: float | None,
     strict: bool,
@@ -278,12 +279,12 @@ def register(
             raise ConfigError("--watch: expected one folder or igtl://... and no --truth.")
         verdicts = watch_source(
             twin, parse_source(clouds[0]), output, options, unit=unit, axes=frame, start=begin, formats=formats,
-            idle=idle, say=click.echo,
+            budget=budget, idle=idle, say=click.echo,
         )  # fmt: skip
     else:
         verdicts = register_files(
             twin, clouds, output, options, unit=unit, axes=frame, start=begin, truth=truth, formats=formats,
-            say=click.echo,
+            budget=budget, say=click.echo,
         )  # fmt: skip
     said = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items() if count)
     click.echo(f"{said or 'no frame'}; written to {output}\n{NOTICE}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,8 +10,10 @@ from typing import Any
 
 from .address import Address
 from .answer import Answer, Reply
+from .arguments import WatchArguments
 from .config import ConfigError
 from .register import CloudFile, Scene
+from .schema import option_of
 from .streams import Mailbox, WatchedFolder, fed
 from .twin import Twin
 
@@ -23,8 +24,7 @@ def check_idle(idle: float | None) -> None:
     Raises:
         ConfigError: they are not.
     """
-    if idle is not None and not 0.0 < idle < math.inf:
-        raise ConfigError(f"--idle: expected a positive time in seconds, got {idle}.")
+    option_of(WatchArguments, "idle").check(idle, "--idle")
 
 
 @dataclass(frozen=True, eq=False)

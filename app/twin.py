@@ -56,7 +56,7 @@ Ints = NDArray[np.int64]
 
 Engine = Registrar | HybridRegistrar | ContactRegistrar
 MODEL_ERROR = "model_error.npz"  # in a twin: covariance of its model-error ensemble
-FORMER_MODEL_ERROR = "doubt.npz"  # the name of that file before version 0.2
+FORMER_MODEL_ERROR = "doubt.npz"  # the name of that file before
 Camera = Pose | PosePrior | Literal["align"] | None
 """Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
 is first looked for in the clouds themselves, None for clouds in the coordinates of the body at rest, as well as the

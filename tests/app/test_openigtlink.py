@@ -550,6 +550,6 @@ def test_words_of_the_command_line(mesh_folder: Path, capsys: Any) -> None:
         (("igtl://:18944",), "expected --watch beside a place of OpenIGTLink"),
         (("igtl://:1/x", "--watch"), "source: expected igtl://HOST:PORT"),
         (("tcp://:1", "--watch"), "source: expected a folder or igtl://HOST:PORT"),
-        (("igtl://:18944", "--watch", "--idle", "0"), "--idle: expected a positive time"),
+        (("igtl://:18944", "--watch", "--idle", "0"), "--idle: expected a finite number > 0, in seconds"),
     ):
         assert words in run(capsys, "register", mesh_folder, *arguments, code=2)

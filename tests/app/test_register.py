@@ -385,7 +385,7 @@ def test_a_budget_bounds_each_frame_of_a_sequence(capsys, mesh_folder: Path, mes
     assert [frame["outcome"] for frame in short + long] == ["out_of_time"] * 2 + ["converged"] * 2
     assert short[0]["evaluations"] < long[0]["evaluations"] and short[0]["rms_distance_m"] > long[0]["rms_distance_m"]
     said = register(capsys, mesh_folder, mesh_cloud, "--budget", 0, code=2)
-    assert "--budget: expected a positive time in seconds, got 0.0" in said
+    assert "--budget: expected a finite number > 0, in seconds, got '0'" in said
 
 
 def test_strict_ends_with_code_3(capsys, mesh_folder: Path, mesh_cloud: Path) -> None:
@@ -401,11 +401,14 @@ def test_strict_ends_with_code_3(capsys, mesh_folder: Path, mesh_cloud: Path) ->
     [
         (("--zone", "nowhere"), "registration.zone: expected one of"),
         (("--format", "xyz"), "--format: expected vtu, stl, ply, obj, vtp, nrrd, mrk.json, seq.mrb, got xyz"),
-        (("--noise", "-1"), "registration.noise"),
-        (("--pose", "unknown", "--pose-rotation", "0"), "registration.pose_rotation: Input should be greater than 0"),
+        (("--noise", "-1"), "--noise: expected a finite number > 0, in metres"),
+        (
+            ("--pose", "unknown", "--pose-rotation", "0"),
+            "--pose-rotation: expected a finite number > 0, in degrees, got '0'",
+        ),
         (
             ("--pose", "unknown", "--pose-translation", "0"),
-            "registration.pose_translation: Input should be greater than 0",
+            "--pose-translation: expected a finite number > 0, in metres, got '0'",
         ),
         (("--zone", "tip", "--parameter", "moved@tip"), "got tip, all of which moved@ holds"),
         (("--truth", "cloud.npy"), "--truth: expected shape"),
