@@ -30,7 +30,7 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from softtwin.app.quickstart import CAMERA, POINTS
-from softtwin.app.twin import DOUBT, find_twin
+from softtwin.app.twin import MODEL_ERROR, find_twin
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import embed
@@ -220,7 +220,7 @@ def main() -> None:
     arguments = parser.parse_args()
     name = arguments.name or (WITHOUT if arguments.no_doubt else NAME)
     found, home = recorded(name), find_twin(arguments.folder)
-    if not (arguments.no_doubt or (home.folder / DOUBT).is_file()):
+    if not (arguments.no_doubt or (home.folder / MODEL_ERROR).is_file()):
         parser.error(f"{arguments.folder}: expected what `softtwin doubt` makes, found none; make it, or --no-doubt")
     for kind in arguments.kinds:
         states: list[tuple[Floats, Floats, Floats]] = []
@@ -243,7 +243,7 @@ def measured(folder: Path, engine: str, states: list[tuple[Floats, Floats, Float
     with tempfile.TemporaryDirectory() as kept:
         place = Path(shutil.copytree(home.folder, Path(kept) / "twin"))
         if not doubt or engine == _LINEAR:  # what it may be otherwise is of another law
-            (place / DOUBT).unlink(missing_ok=True)
+            (place / MODEL_ERROR).unlink(missing_ok=True)
         home = type(home)(place, home.body, home.config.model_copy(update={"material": material}))
         with threadpool_limits(1), home.twin(**ENGINES[engine]) as twin:
             return summary([one(twin, *state) for state in states])

@@ -25,10 +25,11 @@ from pyigtl.messages import CRC64, PointMessage
 from record import write
 from threadpoolctl import threadpool_limits
 
-from softtwin.app.live import Answer, register_live
+from softtwin.app.address import Address
+from softtwin.app.answer import Answer
+from softtwin.app.live import register_live
 from softtwin.app.messages import FIGURES, HEADER_SIZE, Header, Speaker, cloud_message
 from softtwin.app.openigtlink import Link
-from softtwin.app.sources import Address
 from softtwin.app.streams import Mailbox
 from softtwin.app.twin import Sequence, Twin
 from softtwin.meshes.clouds import partial_view

@@ -128,8 +128,8 @@ def _others(figures: Figures) -> str:
         share = f" ({100 * figures.confidence:.0f} % of loads)" if np.isfinite(figures.confidence) else ""
         rows.append((f"largest error{share}", f"≤ {_mm(figures.bound)}"))
     if np.isfinite(figures.net_force):
-        doubt = f" ± {figures.net_force_deviation:.2f}" if np.isfinite(figures.net_force_deviation) else ""
-        rows.append(("net force", f"{figures.net_force:.2f}{doubt} N"))
+        deviation = f" ± {figures.net_force_deviation:.2f}" if np.isfinite(figures.net_force_deviation) else ""
+        rows.append(("net force", f"{figures.net_force:.2f}{deviation} N"))
     if np.isfinite(figures.true_net_force):
         rows.append(("true net force", f"{figures.true_net_force:.2f} N"))
     if figures.askew is not None:

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("viser", reason="viser is absent")
 pytest.importorskip("torch", reason="torch is absent")
 
+from softtwin.app.address import Address
 from softtwin.app.config import ConfigError
 from softtwin.app.page import server as page_server
 from softtwin.app.page.camera import Shot, TrueStates, View, shot
@@ -20,7 +21,6 @@ from softtwin.app.page.figures import Figures
 from softtwin.app.page.session import Session
 from softtwin.app.page.stream import clouds_of, run_live, show
 from softtwin.app.register import Scene
-from softtwin.app.sources import Address
 from softtwin.app.twin import find_twin
 from softtwin.registration.verdict import Verdict
 

@@ -111,7 +111,7 @@ def test_the_hybrid_engine_is_nearer_and_surer_than_the_network(copy: Path, caps
     rows = {}
     for engine in ("surrogate", "hybrid"):
         folder = copy / f"by-{engine}"
-        arguments = ("register", copy, cloud, "--engine", engine, "--truth", copy / "truth.npy", "--output", folder)
+        arguments = ("register", copy, cloud, "--model", engine, "--truth", copy / "truth.npy", "--output", folder)
         assert softtwin(*arguments) == 0
         record = json.loads((folder / "registration.json").read_text())
         assert record["options"]["model"] == engine

@@ -271,7 +271,7 @@ def unsolved(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.parametrize(
     ("flag", "value", "message", "meshed"),
     [
-        ("--ramp", 3, "samples.ramp: expected a divisor of samples.block (8), got 3", False),
+        ("--load-path", 3, "samples.load_path: expected a divisor of samples.block (8), got 3", False),
         ("--displacement", 50.0, "LoadPlan.displacement: expected at most the size of the body", True),
         ("--zone", "tool=fixed.txt", "is on the free boundary", True),
     ],
@@ -303,7 +303,7 @@ def test_one_block_too_many_is_refused(capsys, copy: Path) -> None:
         ("all of the boundary fixed", "expected free nodes on the boundary"),
         ("no body", "softtwin mesh"),
         ("no configuration", "is no TOML"),
-        ("wrong entry", "samples.ramp: expected a divisor"),
+        ("wrong entry", "samples.load_path: expected a divisor"),
     ],
 )
 def test_ranks_end_together_with_one_message(

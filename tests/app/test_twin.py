@@ -106,9 +106,9 @@ def test_who_knows_the_pose_exactly_says_so(plain_twin: Twin) -> None:
     assert sought is not None and not sought.is_said and sought.shift == pytest.approx(0.01)
     for entries in (
         {"pose": "fixed"},
-        {"known_turn": 0.0},
-        {"known_shift": 0.0},
-        {"model": "reference", "forces": "known", "gravity": [0.0, 0.0, -9.81], "unknowns": ["young-modulus"]},
+        {"known_rotation": 0.0},
+        {"known_translation": 0.0},
+        {"model": "reference", "forces": "known", "gravity": [0.0, 0.0, -9.81], "parameters": ["young-modulus"]},
     ):
         twin = Twin(plain_twin.model, Config.model_validate({"registration": entries}))
         assert twin.as_said is None
