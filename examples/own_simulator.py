@@ -47,7 +47,7 @@ def main(folder: Path) -> float:
     data = data_set_from_arrays(
         folder / "data.zarr", body, forces, displacements, length_unit="mm", force_unit="N", source="cantilever"
     )
-    surrogate = train(data, TrainingPlan(Reduced(modes=4, width=32, depth=2), epochs=400))
+    surrogate = train(data, TrainingPlan(Reduced(modes=4, width=32, depth=2), epochs=150))
     found = evaluate(surrogate, data)
     print(found)
     return found.relative_error.median

@@ -171,6 +171,7 @@ def test_a_round_that_is_not_chosen_yet_is_chosen(copied: Workspace, tmp_path: P
 
 
 @pytest.mark.mpi
+@pytest.mark.chain
 def test_two_ranks_make_the_rounds_together(tmp_path: Path, mpi_environment: dict[str, str]) -> None:
     space = workspace(tmp_path / "twin")
     command = [

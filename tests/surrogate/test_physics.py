@@ -89,7 +89,7 @@ def test_energy_alone_brings_the_network_nearer_to_balance(kind: str, soft: Data
     truth = ElasticBody(soft.body, soft.material)
 
     def energy(physics: Physics | None) -> float:
-        plan = TrainingPlan(KINDS[kind], epochs=60, batch=16, physics=physics)
+        plan = TrainingPlan(KINDS[kind], epochs=30, batch=16, physics=physics)
         surrogate = train(soft, plan)
         found = torch.from_numpy(np.stack([surrogate.solve(b).displacement for b in forces]))
         return float(truth.potential(found * truth.free, torch.from_numpy(forces)).mean())

@@ -432,7 +432,7 @@ def test_training_that_gets_no_better_ends_early(
 ) -> None:
     """Ten times the rate that is good for it: the error soon stays above its least. Each round leaves a line."""
     monkeypatch.setattr(training, "ROUNDS", 40)
-    plan = replace(small_plan, epochs=200, learning_rate=0.05)
+    plan = replace(small_plan, epochs=80, learning_rate=0.05)
     whole = train(data, plan)
     short = train(data, replace(plan, patience=3), tmp_path)
     assert short.card["training"]["steps"] < whole.card["training"]["steps"]
