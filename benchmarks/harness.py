@@ -1,0 +1,557 @@
+"""What all benchmarks share: the command line, rows that go on where they stopped, the table, the record.
+
+    python benchmarks/harness.py list                 # every benchmark, its record and what this is about
+    python benchmarks/harness.py stale                # records older than the code they are about, dirty or orphan ones
+    python benchmarks/harness.py tables [--into PAGE] # tables of the records that are there
+
+A script declares a `Benchmark` and ends with `run(BENCHMARK)`. Its `name`, `title`, `about`, `under` and `also` are
+written as literals, since `list` and `stale` read them from the source: they need nothing that the scripts import.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import fnmatch
+import importlib
+import io
+import json
+import os
+import re
+import string
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, redirect_stdout
+from dataclasses import dataclass, field
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import record
+
+Figures = dict[str, Any]
+
+
+# ---------------------------------------------------------------------- the declaration
+
+
+@dataclass(frozen=True)
+class Setting:
+    """An option of one script.
+
+    Args:
+        default: of it; with None the option may be absent, and `kind` says what it is.
+        says: its help.
+        kind: makes it from a word; the default's own type if not given.
+        choices: that it is one of, or several of where the default is a tuple.
+        picks: it picks rows, places or ranks: no figure of a row depends on it.
+        is_given: it stands without a name, and has to.
+    """
+
+    default: Any = None
+    says: str = ""
+    kind: Callable[[str], Any] | None = None
+    choices: tuple[str, ...] = ()
+    picks: bool = False
+    is_given: bool = False
+
+
+FOLDER = Setting(says="what `softtwin quickstart --output FOLDER` makes", kind=Path, picks=True, is_given=True)
+RANKS = Setting(2, "that make data", picks=True)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the printed table.
+
+    Args:
+        heading: of it.
+        unit: of its numbers; empty for those that have none, or for several.
+        cell: what stands in it: a format over a row's figures, `{tre_mm.mean:.2f}`, `{force_error*100:.1f}`, or a
+            function of them. What a row does not have is a dash.
+    """
+
+    heading: str
+    unit: str
+    cell: str | Callable[[Figures], object]
+
+    @property
+    def head(self) -> str:
+        """Heading and unit."""
+        return f"{self.heading}, {self.unit}" if self.unit else self.heading
+
+
+class Given:
+    """The settings of a run as attributes, and what its rows share.
+
+    Args:
+        settings: by name, with underscores.
+        opened: closes what rows have opened.
+    """
+
+    def __init__(self, settings: Mapping[str, Any], opened: ExitStack) -> None:
+        self.settings, self._opened, self._made = dict(settings), opened, dict[Any, Any]()
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self.__dict__["settings"][name]
+        except KeyError:
+            raise AttributeError(f"no setting {name}") from None
+
+    def once(self, make: Callable[..., Any], *words: Any) -> Any:
+        """What a function makes of some arguments, made once a run."""
+        if (make, words) not in self._made:
+            self._made[make, words] = make(*words)
+        return self._made[make, words]
+
+    def opened(self, make: Callable[..., Any], *words: Any) -> Any:
+        """What a context manager yields, entered once a run and left at its end."""
+        if (make, words) not in self._made:
+            self._made[make, words] = self._opened.enter_context(make(*words))
+        return self._made[make, words]
+
+
+def _as_they_are(figures: Figures) -> Iterable[tuple[str, Figures]]:
+    return ((name, row) for name, row in figures.items() if isinstance(row, dict))
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A benchmark.
+
+    Args:
+        name: of its record; `{mesh}` stands for what the setting of that name is.
+        title: what it measures, in one line.
+        about: folders and files that its figures are about, from the repository's root.
+        work: figures of one row, by its name and what is given.
+        rows: their names, or a function of what is given; one without a name where the figures are one row's.
+        columns: of the printed table; none: the figures are printed.
+        settings: options by name.
+        seeds: that chance begins with; recorded.
+        small: settings for a look in a minute, which is not recorded.
+        under: entry of the figures that holds the rows; empty: the figures are the rows.
+        finish: further figures, by those of all rows and what is given.
+        lines: of the table, with their labels, by the rows; those of the record if not given.
+        also: other names of its records, with * for anything.
+        threads: of each library.
+    """
+
+    name: str
+    title: str
+    about: tuple[str, ...]
+    work: Callable[[str, Given], Any]
+    rows: Sequence[str] | Callable[[Given], Iterable[str]] = ("",)
+    columns: tuple[Column, ...] = ()
+    settings: Mapping[str, Setting] = field(default_factory=dict)
+    seeds: tuple[int, ...] = ()
+    small: Mapping[str, Any] = field(default_factory=dict)
+    under: str = ""
+    finish: Callable[[Figures, Given], Figures] | None = None
+    lines: Callable[[Figures], Iterable[tuple[str, Figures]]] = _as_they_are
+    also: tuple[str, ...] = ()
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.about:
+            raise ValueError(f"{self.name}: about: expected at least one folder or file, got none.")
+        unknown = set(self.small) - set(self.settings)
+        if unknown:
+            raise ValueError(f"{self.name}: small: no settings {', '.join(sorted(unknown))}.")
+
+    @property
+    def script(self) -> Path:
+        """The file that its work stands in."""
+        return Path(sys.modules[self.work.__module__].__file__ or "")
+
+    def rows_of(self, figures: Figures) -> Figures:
+        """The rows among the figures of a record."""
+        return figures.setdefault(self.under, {}) if self.under else figures
+
+
+# ---------------------------------------------------------------------- a run
+
+
+def run(
+    benchmark: Benchmark,
+    words: Sequence[str] | None = None,
+    parts: Mapping[str, Callable[..., None]] | None = None,
+) -> Figures:
+    """Run a benchmark by the command line, or by these words; returns its figures.
+
+    Args:
+        benchmark: what to run.
+        words: of the command line; the process's own if not given.
+        parts: what this script does in processes of its own (`started`), by name.
+    """
+    words = list(sys.argv[1:] if words is None else words)
+    if parts and words and words[0] in parts:
+        parts[words[0]](*words[1:])
+        return {}
+    options = _parsed(benchmark, words)
+    name = options.name or benchmark.name.format(**vars(options))
+    if options.table:
+        print(table(benchmark, name, record.recorded(name)))
+        return record.recorded(name)
+    is_dry = options.dry or getattr(options, "small", False)
+    try:
+        if not is_dry:
+            record.commit()
+            record.check_clean()
+        command = " ".join(["python", f"benchmarks/{benchmark.script.name}", *words])
+        return _all_rows(benchmark, name, options, command, is_dry)
+    except record.NotRecordedError as error:
+        raise SystemExit(f"{name}: {error}") from None
+
+
+def _parsed(benchmark: Benchmark, words: Sequence[str]) -> argparse.Namespace:
+    told = sys.modules[benchmark.work.__module__].__doc__ or benchmark.title
+    parser = argparse.ArgumentParser(description=told, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, setting in benchmark.settings.items():
+        _add(parser, name, setting)
+    parser.add_argument("--only", nargs="+", default=(), metavar="ROW", help="rows of this name, or that have it in it")
+    parser.add_argument("--fresh", action="store_true", help="make rows again that are recorded")
+    parser.add_argument("--dry", action="store_true", help="run, and record nothing")
+    parser.add_argument("--table", action="store_true", help="print the recorded table, and run nothing")
+    parser.add_argument("--name", default="", help="of the record, in place of its own")
+    if benchmark.small:
+        parser.add_argument("--small", action="store_true", help="a look in a minute; records nothing")
+        if "--small" in words:
+            parser.set_defaults(**benchmark.small)
+    return parser.parse_args(words)
+
+
+def _add(parser: argparse.ArgumentParser, name: str, setting: Setting) -> None:
+    several = isinstance(setting.default, tuple)
+    flag = name if setting.is_given else f"--{name.replace('_', '-')}"
+    if isinstance(setting.default, bool):
+        parser.add_argument(flag, action="store_true", help=setting.says)
+        return
+    first = setting.default[0] if several and setting.default else setting.default
+    told: dict[str, Any] = {"help": setting.says, "type": setting.kind or (str if first is None else type(first))}
+    told |= {"choices": setting.choices} if setting.choices else {}
+    told |= {"nargs": "+"} if several else {}
+    told |= {} if setting.is_given else {"default": setting.default}
+    parser.add_argument(flag, **told)
+
+
+def _all_rows(benchmark: Benchmark, name: str, options: argparse.Namespace, command: str, is_dry: bool) -> Figures:
+    from threadpoolctl import threadpool_limits
+
+    known = {} if is_dry else record.read(name)
+    figures, made = known.get("figures", {}), record.made_of(known, benchmark.under) if known else {}
+    settings = {each: getattr(options, each) for each in benchmark.settings}
+    kept = {each: value for each, value in settings.items() if not benchmark.settings[each].picks}
+    with ExitStack() as opened, threadpool_limits(benchmark.threads):
+        given = Given(settings, opened)
+        wanted = _chosen(benchmark, given, options.only)
+        for place, row in enumerate(wanted):
+            label = f"[{place + 1}/{len(wanted)}] {row or name}"
+            told = made.get(row, {}) if row in made or not row else made.get("", {})
+            if not (is_dry or options.fresh) and _is_current(benchmark, figures, row, told, kept):
+                print(f"{label}: recorded at {told['commit']}", flush=True)
+                continue
+            print(f"{label} ...", flush=True)
+            begun = time.perf_counter()
+            found = _as_json(benchmark.work(row, given))
+            seconds = time.perf_counter() - begun
+            figures = _with(benchmark, figures, row, found)
+            print(f"{label}: {seconds:.1f} s; {_line(benchmark, row, found)}", flush=True)
+            if benchmark.finish is not None:
+                figures |= _as_json(benchmark.finish(figures, given))
+            if not is_dry:
+                record.check_clean([*benchmark.about, "benchmarks"])
+                made[row] = {"commit": record.commit(), "date": time.strftime("%Y-%m-%d"), "command": command}
+                made[row] |= {"seconds": round(seconds, 2), "settings": _as_json(kept), "seeds": list(benchmark.seeds)}
+                made[row] |= {"on": record.processor(), "gpu": record.gpu()}
+                record.write(name, figures, made, command)
+    print(table(benchmark, name, figures))
+    print("nothing is recorded (--dry)" if is_dry else f"recorded: benchmarks/results/{name}.json")
+    return figures
+
+
+def _chosen(benchmark: Benchmark, given: Given, only: Sequence[str]) -> list[str]:
+    rows = list(benchmark.rows(given) if callable(benchmark.rows) else benchmark.rows)
+    exact = [row for row in rows if row in only]
+    chosen = exact if len(exact) == len(only) else [row for row in rows if any(word in row for word in only)]
+    if only and not chosen:
+        raise SystemExit(f"--only: expected one of {', '.join(map(repr, rows))}, got {', '.join(map(repr, only))}")
+    return chosen if only else rows
+
+
+def _is_current(benchmark: Benchmark, figures: Figures, row: str, told: Figures, kept: Figures) -> bool:
+    """Whether a row is there, from the last commit of what it is about, and made by the same settings."""
+    if not (row in benchmark.rows_of(figures) if row else figures):
+        return False
+    return record.holds(told.get("commit", ""), benchmark.about) and told.get("settings") == _as_json(kept)
+
+
+def _with(benchmark: Benchmark, figures: Figures, row: str, found: Any) -> Figures:
+    if not row:
+        return dict(found)
+    benchmark.rows_of(figures)[row] = found
+    return figures
+
+
+def _as_json(value: Any) -> Any:
+    """As a record has it, so that a table printed at once and one of the record are the same."""
+    return json.loads(json.dumps(value, default=record.plain))
+
+
+def started(script: str, *words: str, ranks: int = 1, **how: Any) -> subprocess.CompletedProcess[str]:
+    """Run a part of a script in a process of its own, on so many ranks, with one thread each."""
+    command = [sys.executable, script, *words]
+    if ranks > 1:
+        command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), *command]
+    return subprocess.run(command, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}, text=True, **{"check": True, **how})
+
+
+# ---------------------------------------------------------------------- tables
+
+
+class _Cells(string.Formatter):
+    """Formats with paths into nested figures and a factor: `{tre_mm.mean:.2f}`, `{force_error*100:.1f}`."""
+
+    def get_field(self, field_name: str, args: Any, kwargs: Any) -> tuple[Any, str]:
+        path, _, factor = field_name.partition("*")
+        value = reduce(lambda at, key: at[int(key)] if isinstance(at, list) else at[key], path.split("."), kwargs)
+        if value is None:
+            raise KeyError(path)
+        return (float(factor) * value if factor else value), path
+
+
+def cell(column: Column, figures: Figures) -> str:
+    """What stands in a column of a row; a dash where the row has no such figure."""
+    try:
+        if callable(column.cell):
+            return str(column.cell(figures))
+        return _Cells().vformat(column.cell, (), figures)
+    except (KeyError, IndexError, TypeError):
+        return "-"
+
+
+def _line(benchmark: Benchmark, row: str, found: Figures) -> str:
+    if not isinstance(found, dict):
+        return str(found)
+    lines = list(benchmark.lines({row: found} if row else found)) if benchmark.columns else []
+    told = [
+        f"{label} ".lstrip() + ", ".join(f"{c.head} {cell(c, each)}" for c in benchmark.columns)
+        for label, each in lines
+    ]
+    return "; ".join(told) or json.dumps(found)[:300]
+
+
+def table(benchmark: Benchmark, name: str, figures: Figures) -> str:
+    """The figures of a record as a table in Markdown."""
+    if not benchmark.columns:
+        return json.dumps(figures, indent=1)
+    lines = [
+        [label, *(cell(c, each) for c in benchmark.columns)]
+        for label, each in benchmark.lines(benchmark.rows_of(figures))
+    ]
+    return markdown([name, *(c.head for c in benchmark.columns)], lines)
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines) + "\n"
+
+
+def columns(**cells: str | Callable[[Figures], object]) -> tuple[Column, ...]:
+    """Columns by heading alone, for figures without a unit."""
+    return tuple(Column(heading.replace("_", " "), "", each) for heading, each in cells.items())
+
+
+def verdicts(found: Figures) -> str:
+    """How many frames were accepted, doubtful and refused."""
+    return "; ".join(str(found["verdicts"].get(name, 0)) for name in ("accepted", "doubtful", "refused"))
+
+
+def shares(covered: Mapping[str, float]) -> str:
+    """Per cent, in their order."""
+    return " / ".join(f"{100 * share:.0f}" for share in covered.values())
+
+
+def tables_of(page: str) -> dict[str, str]:
+    """The tables of a page in Markdown, by their first headings."""
+    found = re.findall(r"(?:^\|.*\n?)+", page, flags=re.MULTILINE)
+    return {each.split("|")[1].strip(): each.rstrip("\n") for each in found}
+
+
+def tables() -> str:
+    """The tables of all records whose scripts can be loaded here; others are named."""
+    printed = []
+    for declared in declarations():
+        try:
+            module = importlib.import_module(declared.script.removesuffix(".py"))
+        except ImportError as error:
+            print(f"{declared.script}: not loaded: {error}", file=sys.stderr)
+            continue
+        for benchmark in (each for each in vars(module).values() if isinstance(each, Benchmark)):
+            if benchmark.name == declared.name and benchmark.columns:
+                names = [path.stem for path in sorted(record.RESULTS.glob("*.json")) if declared.declares(path.stem)]
+                printed += [table(benchmark, name, record.recorded(name)) for name in names]
+    return "\n".join(printed)
+
+
+# ---------------------------------------------------------------------- what is there, and how old it is
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What a declaration says of itself in its source.
+
+    Args:
+        script: its file's name.
+        name: of its record, as declared.
+        title: in one line.
+        about: folders and files.
+        under: entry of the figures with the rows.
+        also: other names of its records.
+    """
+
+    script: str
+    name: str
+    title: str
+    about: tuple[str, ...]
+    under: str = ""
+    also: tuple[str, ...] = ()
+
+    def declares(self, record_name: str) -> bool:
+        """Whether a record of that name is one of its."""
+        return any(fnmatch.fnmatchcase(record_name, each) for each in (re.sub(r"\{\w+\}", "*", self.name), *self.also))
+
+
+def declarations() -> list[Declared]:
+    """The declarations of all scripts beside the records, read from their source.
+
+    Raises:
+        ValueError: an entry that is no literal, or a path that is not there.
+    """
+    found = []
+    for path in sorted(record.RESULTS.parent.glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Benchmark":
+                found.append(_declared(path.name, node))
+    return found
+
+
+def _declared(script: str, call: ast.Call) -> Declared:
+    entries = {}
+    for keyword in call.keywords:
+        if keyword.arg in ("name", "title", "about", "under", "also"):
+            try:
+                entries[keyword.arg] = ast.literal_eval(keyword.value)
+            except ValueError:
+                raise ValueError(f"{script}: {keyword.arg}: expected a literal, line {keyword.value.lineno}") from None
+    absent = [path for path in entries["about"] if not (record.ROOT / path).exists()]
+    if absent:
+        raise ValueError(f"{script}: about: no such files: {', '.join(absent)}")
+    return Declared(script, **entries)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A record that no present figure may be quoted from without a look.
+
+    Args:
+        record: its name.
+        state: `older` than what it is about, of a `dirty` tree, without a commit (`unknown`), or an `orphan`.
+        rows: how many of its rows.
+        of: how many there are; 0 where the record does not tell its rows apart.
+        says: more, in words.
+    """
+
+    record: str
+    state: str
+    rows: int
+    of: int
+    says: str
+
+    def __str__(self) -> str:
+        count = f"{self.rows} of {self.of} rows" if self.of else "all of it"
+        return f"{self.record:42} {self.state:8} {'' if self.state == 'orphan' else count:18} {self.says}"
+
+
+def audit() -> list[Finding]:
+    """What is to be said of the records, by name; nothing of one that is of the last commit of what it is about."""
+    declared, found = declarations(), list[Finding]()
+    for path in sorted(record.RESULTS.glob("*.json")):
+        owner = next((each for each in declared if each.declares(path.stem)), None)
+        if owner is None:
+            found.append(Finding(path.stem, "orphan", 0, 0, "no script declares it"))
+        else:
+            found += _of_record(path.stem, owner)
+    return found
+
+
+def _of_record(name: str, owner: Declared) -> list[Finding]:
+    made = record.made_of(record.read(name), owner.under)
+    states: dict[str, list[str]] = {}
+    for told in made.values():
+        states.setdefault(_state(told.get("commit", ""), owner.about), []).append(told.get("commit", ""))
+    of = len(made) if set(made) != {""} else 0
+    change = record.git("log", "-1", "--format=%h of %cs", record.last_change(owner.about)) or "?"
+    says = {
+        "older": f"{', '.join(owner.about)} changed in {change}",
+        "dirty": "made with uncommitted changes",
+        "unknown": "names no commit that is here",
+    }
+    return [
+        Finding(
+            name, state, len(each), of, f"{', '.join(sorted(set(filter(None, each))))[:60]}; {says[state]}".lstrip("; ")
+        )
+        for state, each in states.items()
+        if state != "current"
+    ]
+
+
+def _state(commit: str, about: tuple[str, ...]) -> str:
+    if commit.endswith("-dirty"):
+        return "dirty"
+    if not commit or record.git("cat-file", "-e", f"{commit}^{{commit}}") is None:
+        return "unknown"
+    return "current" if record.holds(commit, about) else "older"
+
+
+def listed() -> str:
+    """Every benchmark with its records: name, commit and day."""
+    lines, names = [], [path.stem for path in sorted(record.RESULTS.glob("*.json"))]
+    for each in declarations():
+        lines.append(f"{each.script:32} {each.title}\n{'':32} about {', '.join(each.about)}")
+        for name in filter(each.declares, names):
+            told = record.read(name)
+            lines.append(f"{'':32} {name}: {told.get('commit', 'no commit')}, {told.get('date', 'no date')}")
+    return "\n".join(lines)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """`list`, `stale` or `tables`."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["list", "stale", "tables"])
+    parser.add_argument("--into", type=Path, help="a page whose tables of the same first heading are replaced")
+    options = parser.parse_args(words)
+    if options.what == "tables":
+        with redirect_stdout(io.StringIO()):  # what scripts say while they are loaded
+            printed = tables()
+        if options.into is None:
+            print(printed, end="")
+            return
+        page, new = options.into.read_text(), tables_of(printed)
+        for heading, old in tables_of(page).items():
+            page = page.replace(old, new.get(heading, old))
+        options.into.write_text(page)
+        return
+    if options.what == "list":
+        print(listed())
+        return
+    found = audit()
+    print("\n".join(map(str, found)) or "every record is of the last commit of what it is about")
+
+
+if __name__ == "__main__":
+    from harness import main as run_as_module  # scripts import this file by its name: one module, not two
+
+    run_as_module()
