@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 from beam_hard import draw
+from harness import Benchmark, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
 from numpy.typing import NDArray
-from record import write
 from scipy.optimize import brentq
-from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import NeoHookean, SaintVenantKirchhoff
@@ -145,14 +144,16 @@ def resident_MiB() -> float:  # noqa: N802 - the unit's own letters
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def main() -> None:
-    figures = {}
-    with threadpool_limits(1):
-        for study in (large_beam, real_liver, gradients, memory):
-            figures[study.__name__] = study()
-            print(study.__name__, figures[study.__name__], flush=True)
-    write("reference_solves", figures)
+STUDIES = {study.__name__: study for study in (large_beam, real_liver, gradients, memory)}
+BENCHMARK = Benchmark(
+    name="reference_solves",
+    title="What solves of the reference cost: a beam of 12,000 unknowns, the real liver, gradients, memory",
+    about=("reference",),
+    work=lambda row, given: STUDIES[row](),
+    rows=tuple(STUDIES),
+    seeds=(0, 1),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -1,6 +1,6 @@
 """The reference's steps on the real liver: cold, far from the state it starts at, released, and columns of push.
 
-python benchmarks/reference_starts.py
+    python benchmarks/reference_starts.py
 
 Forces are those of frame 49 of s1, s2 and s3, and shares of them; tolerance and limits are those of registration.
 """
@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from harness import Benchmark, Given, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
-from record import write
 
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.outcome import NotConverged
@@ -74,15 +74,23 @@ def steps(model: ReferenceModel, name: str) -> list[dict[str, Any]]:
     return rows
 
 
-def main() -> None:
-    figures = {}
-    newton = NewtonOptions(tolerance=1e-5, max_iterations=15)
-    with Problem(liver(), NeoHookean(YOUNG_MODULUS, POISSON_RATIO), newton) as problem:
-        for name in SEQUENCES:
-            print(name)
-            figures[name] = steps(ReferenceModel(problem, patient=False), name)
-    write("reference_starts", {"tolerance": newton.tolerance, "sequences": figures})
+LOOSE, MATERIAL = NewtonOptions(tolerance=1e-5, max_iterations=15), NeoHookean(YOUNG_MODULUS, POISSON_RATIO)
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    problem = given.opened(Problem, given.once(liver), MATERIAL, LOOSE)
+    return {"tolerance": LOOSE.tolerance, "steps": steps(ReferenceModel(problem, patient=False), row)}
+
+
+BENCHMARK = Benchmark(
+    name="reference_starts",
+    title="The reference's steps on the real liver: cold, far from where it starts, released, columns of push",
+    about=("reference",),
+    work=work,
+    rows=SEQUENCES,
+    seeds=(0,),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)
