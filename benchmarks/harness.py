@@ -135,6 +135,7 @@ class Benchmark:
         finish: further figures, by those of all rows and what is given.
         lines: of the table, with their labels, by the rows; those of the record if not given.
         also: other names of its records, with * for anything.
+        named: the record's name by the options, where it is one of the others.
         threads: of each library.
     """
 
@@ -151,6 +152,7 @@ class Benchmark:
     finish: Callable[[Figures, Given], Figures] | None = None
     lines: Callable[[Figures], Iterable[tuple[str, Figures]]] = _as_they_are
     also: tuple[str, ...] = ()
+    named: Callable[[argparse.Namespace], str] | None = None
     threads: int = 1
 
     def __post_init__(self) -> None:
@@ -190,7 +192,8 @@ def run(
         parts[words[0]](*words[1:])
         return {}
     options = _parsed(benchmark, words)
-    name = options.name or benchmark.name.format(**vars(options))
+    own = benchmark.name.format(**vars(options)) if benchmark.named is None else benchmark.named(options)
+    name = options.name or own
     if options.table:
         print(table(benchmark, name, record.recorded(name)))
         return record.recorded(name)
@@ -336,10 +339,10 @@ def _line(benchmark: Benchmark, row: str, found: Figures) -> str:
         return str(found)
     lines = list(benchmark.lines({row: found} if row else found)) if benchmark.columns else []
     told = [
-        f"{label} ".lstrip() + ", ".join(f"{c.head} {cell(c, each)}" for c in benchmark.columns)
+        f"{label} ".lstrip() + "; ".join(f"{c.head}: {cell(c, each)}" for c in benchmark.columns)
         for label, each in lines
     ]
-    return "; ".join(told) or json.dumps(found)[:300]
+    return " | ".join(told) or json.dumps(found)[:600]
 
 
 def table(benchmark: Benchmark, name: str, figures: Figures) -> str:
