@@ -302,11 +302,13 @@ def _as_json(value: Any) -> Any:
     return json.loads(json.dumps(value, default=record.plain))
 
 
-def started(script: str, *words: str, ranks: int = 1, **how: Any) -> subprocess.CompletedProcess[str]:
-    """Run a part of a script in a process of its own, on so many ranks, with one thread each."""
+def started(
+    script: str, *words: str, ranks: int = 1, bind: str = "none", **how: Any
+) -> subprocess.CompletedProcess[str]:
+    """Run a part of a script in processes of its own: so many ranks of one thread each, bound to what MPI is told."""
     command = [sys.executable, script, *words]
     if ranks > 1:
-        command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), *command]
+        command = ["mpirun", "--oversubscribe", "--bind-to", bind, "-n", str(ranks), *command]
     return subprocess.run(command, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}, text=True, **{"check": True, **how})
 
 

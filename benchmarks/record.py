@@ -71,9 +71,10 @@ def check_clean(paths: Sequence[str] = (".",)) -> None:
     changed = uncommitted(paths)
     if changed:
         shown = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
+        count = f"{len(changed)} uncommitted change{'s' * (len(changed) > 1)}"
         raise NotRecordedError(
-            f"{len(changed)} uncommitted change{'s' * (len(changed) > 1)} ({shown}): a record names the commit that its figures are of. "
-            "Commit first, or run with --dry, which records nothing."
+            f"{count} ({shown}): a record names the commit that its figures are of. Commit first, or run with --dry, "
+            "which records nothing."
         )
 
 
