@@ -15,13 +15,10 @@ from typing import Any
 
 import numpy as np
 from harness import RANKS, Benchmark, Column, Given, Setting, run
+from made import beam_data
 from networks import AMPLITUDES
 from record import RUNS
 
-from softtwin.app.chain import prepare
-from softtwin.app.config import Config
-from softtwin.app.launch import generate_in_parallel
-from softtwin.app.stages.mesh import mesh_stage
 from softtwin.meshes.metrics import nodal_distances, relative_error
 from softtwin.reference.data.dataset import DataSet, existing
 from softtwin.surrogate.model import Surrogate
@@ -46,16 +43,11 @@ def data_of(loads: str, is_active: bool, seconds: float, ranks: int) -> DataSet:
     own = {"train": FIRST, "rounds": ROUNDS, "chosen": CHOSEN, "candidates": CANDIDATES, "test": 16}
     samples = own if is_active else {"train": RANDOM, "test": TEST}
     entries = {
-        "folder": ".",
-        "body": {"source": "beam"},
         "loads": LOADS[loads],
         "samples": {**samples, "validation": 256, "block": 16, "ranks": ranks, "jacobians": False},
         "training": {"seconds": seconds},
     }
-    space = prepare(Config.model_validate(entries), folder)
-    mesh_stage(space)
-    generate_in_parallel(folder / "organ.toml", ranks)
-    return DataSet(space.data)
+    return beam_data(folder, entries, ranks)
 
 
 def judged(surrogate: Surrogate, data: DataSet) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+import made
 import numpy as np
 import torch
 from harness import RANKS, Benchmark, Column, Given, Setting, run
@@ -28,6 +29,7 @@ from networks_bodies import case, data_of
 from numpy.typing import NDArray
 from record import RUNS
 from scipy.optimize import minimize
+from summaries import counts
 from tqdm import tqdm
 
 from softtwin.meshes.body import Body
@@ -49,8 +51,6 @@ from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.residual import ElasticBody
 from softtwin.surrogate.train import train
-from softtwin.surrogate.twin import load as load_twin
-from softtwin.surrogate.twin import save
 
 Floats = NDArray[np.float64]
 BODY = "beam-6.1"
@@ -122,10 +122,12 @@ def cases(data: DataSet, problem: Problem, count: int) -> Iterator[Case]:
 def network_of(data: DataSet, seconds: float) -> Surrogate:
     """The reduced network, trained once."""
     folder = RUNS / f"{BODY}-{seconds:g}s"
-    if not (folder / "surrogate.json").exists():
+
+    def learn() -> Surrogate:
         learned = train(data, TrainingPlan(Reduced(modes=64), seconds=seconds))
-        save(with_discrepancy(with_domain(learned, data), data), folder)
-    return load_twin(folder, data.body)
+        return with_discrepancy(with_domain(learned, data), data)
+
+    return made.network(folder, data.body, learn)
 
 
 class Clock:
@@ -282,8 +284,7 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     wrong = [row["mean_m"] > WRONG for row in done]
     found["matched"] = float(np.mean(matched))
     found["matched_in_a_wrong_state"] = float(np.mean(np.logical_and(matched, wrong)))
-    verdicts = [row["verdict"] for row in done]
-    found["verdicts"] = {name: verdicts.count(name) for name in sorted(set(verdicts)) if name}
+    found["verdicts"] = counts(row["verdict"] for row in done)
     accepted = [row["mean_m"] for row in done if row["verdict"] == "accepted"]
     found["accepted_largest_mean_m"] = max(accepted, default=None)
     stress = [row["stress_off"] for row in done if row["stress_off"] is not None]

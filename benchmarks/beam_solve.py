@@ -6,12 +6,14 @@ python benchmarks/beam_solve.py
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
 from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
 from scipy.optimize import brentq
+from summaries import median_seconds
 
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import NeoHookean
@@ -37,16 +39,6 @@ def deflection(problem: Problem, newtons: float) -> float:
     return float(np.linalg.norm(problem.solve(tip_load(problem, newtons)).displacement[tip].mean(axis=0)))
 
 
-def timed(problem: Problem, forces: NDArray[np.float64], repeats: int, stability: bool) -> float:
-    """Median wall time of a solve from rest, milliseconds."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        problem.solve(forces, stability=stability)
-        seconds.append(time.perf_counter() - begin)
-    return 1e3 * float(np.median(seconds))
-
-
 def work(row: str, given: Given) -> dict[str, Any]:
     with Problem(beam(), NeoHookean(YOUNG_MODULUS, POISSON_RATIO)) as problem:
         newtons = brentq(lambda f: deflection(problem, f) - WANTED, 0.5, 3.0, xtol=1e-4)
@@ -57,8 +49,9 @@ def work(row: str, given: Given) -> dict[str, Any]:
             "tip_deflection_m": deflection(problem, newtons),
             "iterations": state.iterations,
             "factorisations": state.factorisations,
-            "median_ms": timed(problem, forces, given.repeats, stability=False),
-            "median_with_stability_ms": timed(problem, forces, given.repeats, stability=True),
+            "median_ms": 1e3 * median_seconds(partial(problem.solve, forces, stability=False), given.repeats),
+            "median_with_stability_ms": 1e3
+            * median_seconds(partial(problem.solve, forces, stability=True), given.repeats),
             "modal_loads": modal_loads(problem, given.loads),
         }
 

@@ -15,12 +15,9 @@ from typing import Any
 
 import numpy as np
 from harness import RANKS, Benchmark, Column, Given, Setting, run
+from made import beam_data
 from record import RUNS
 
-from softtwin.app.chain import prepare
-from softtwin.app.config import Config
-from softtwin.app.launch import generate_in_parallel
-from softtwin.app.stages.mesh import mesh_stage
 from softtwin.reference.data.dataset import DataSet, Samples
 from softtwin.reference.generate import plan_from_header
 from softtwin.reference.solve.problem import Problem
@@ -35,11 +32,7 @@ def make_data(folder: Path, ranks: int) -> DataSet:
     """The data set: modal loads of fixed amplitude as in the thesis; what is there is not made again."""
     samples = {"train": 2048, "validation": 256, "test": 512, "block": 16, "ranks": ranks}
     loads = {"amplitude": 0.03, "patches": 1, "radius": (0.055, 0.64)}
-    config = Config.model_validate({"folder": ".", "body": {"source": "beam"}, "loads": loads, "samples": samples})
-    space = prepare(config, folder)
-    mesh_stage(space)
-    generate_in_parallel(folder / "organ.toml", ranks)
-    return DataSet(space.data)
+    return beam_data(folder, {"loads": loads, "samples": samples}, ranks)
 
 
 KINDS = {"reduced": Reduced(), "mlp": Perceptron()}

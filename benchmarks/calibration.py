@@ -30,6 +30,7 @@ from networks_bodies import data_of
 from numpy.typing import NDArray
 from record import RUNS
 from scipy.stats import chi2, norm
+from summaries import counts, predicted_mm
 from tqdm import tqdm
 
 from softtwin.meshes.body import Body, Surface
@@ -180,7 +181,7 @@ def one(case: Case, registrar: Any, forces: Floats, truth: Floats, rng: np.rando
     return {
         "verdict": result.judgement.verdict.value,
         "error_mm": 1e3 * float(errors.mean()),
-        "predicted_mm": 1e3 * float(np.sqrt(8.0 / (3.0 * np.pi)) * known.deviation.mean()),
+        "predicted_mm": predicted_mm(known),
         "covered": [float((errors <= known.margin(None, share))[free].mean()) for share in SHARES],
         "z": np.linalg.solve(root, missed).tolist(),
         "ranks": norm.cdf(-missed / result.net_force_deviation).tolist(),
@@ -196,10 +197,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     errors, predicted = (np.array([row[name] for row in used]) for name in ("error_mm", "predicted_mm"))
     steps = np.arange(1, len(used) + 1) / len(used)
     apart = np.maximum(steps[:, None] - ranks, ranks - steps[:, None] + 1.0 / len(used)).max(axis=0)
-    verdicts = [row["verdict"] for row in rows]
     return {
         "cases": len(rows),
-        "verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))},
+        "verdicts": counts(row["verdict"] for row in rows),
         "error_mm": float(errors.mean()),
         "predicted_mm": float(predicted.mean()),
         "correlation": float(np.corrcoef(errors, predicted)[0, 1]),

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import made
 import numpy as np
 from harness import RANKS, Benchmark, Column, Given, Setting, run
 from networks import data_of as small_data
@@ -32,8 +33,6 @@ from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.signs import SignReader
 from softtwin.surrogate.train import train
-from softtwin.surrogate.twin import load as load_twin
-from softtwin.surrogate.twin import save
 
 FRESH = 1_000_000  # numbers of loads begin here: none of them is in a data set
 FAR, TIMED, STEPPED = 1000, 100, 400  # loads three times too large; predictions that are timed; Newton's steps
@@ -44,13 +43,15 @@ SPLITS = 20  # ways to split the loads that calibrate from those that judge
 def network_of(body: str, data: DataSet, seconds: float, ranks: int, stepped: int = STEPPED) -> Surrogate:
     """The reduced network of a body, trained once; that of the small beam under modal loads on table 4.2's samples."""
     folder = RUNS / f"certificates-{body}-{seconds:g}s"
-    if not (folder / "surrogate.json").exists():
+
+    def learn() -> Surrogate:
         learned = data
         if body == "modal":
             learned = small_data("modal", {"train": 8192, "validation": 256, "test": 512}, ranks, jacobians=True)
         plan = TrainingPlan(Reduced(modes=case(body).modes), seconds=seconds)
-        save(with_domain(train(learned, plan), learned), folder)
-    return calibrate(load_twin(folder, data.body), data, stepped=stepped)
+        return with_domain(train(learned, plan), learned)
+
+    return calibrate(made.network(folder, data.body, learn), data, stepped=stepped)
 
 
 def set_aside(certifier: Certifier, data: DataSet, plan: Plan, problem: Problem) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from liver import SEQUENCES, sequence
 from numpy.typing import NDArray
 from record import RUNS
 from robustness import clean, forward_model, registrar_for, towards_camera
+from summaries import counts
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.outcome import NotConverged
@@ -100,8 +101,7 @@ def judged(result: Registration, rest: Floats, truth: Floats) -> dict[str, Any]:
 def summary(rows: list[dict[str, Any]], failed: int) -> dict[str, Any]:
     """Over all frames, and over those that were accepted; frames without a state are counted alone."""
     found: dict[str, Any] = {"frames": len(rows) + failed, "failed": failed}
-    verdicts = [row["verdict"] for row in rows]
-    found["verdicts"] = {name: verdicts.count(name) for name in sorted(set(verdicts))}
+    found["verdicts"] = counts(row["verdict"] for row in rows)
     groups = {
         "all": rows,
         "accepted": [row for row in rows if row["verdict"] == "accepted"],

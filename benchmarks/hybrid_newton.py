@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+import made
 import numpy as np
 import torch
 from harness import RANKS, Benchmark, Column, Given, Setting, run
@@ -39,8 +40,6 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
-from softtwin.surrogate.twin import load as load_twin
-from softtwin.surrogate.twin import save
 
 Floats = NDArray[np.float64]
 COUNTS = {"small": 1000, "large": 100, "liver": 100}
@@ -173,11 +172,9 @@ def data_of(body: str, ranks: int) -> DataSet:
 
 def network_of(body: str, data: DataSet, seconds: float) -> Surrogate:
     """The reduced network of a body, trained once."""
-    folder = RUNS / f"hybrid-{body}-{seconds:g}s"
-    if not (folder / "surrogate.json").exists():
-        modes = Reduced().modes if body == "small" else case(CASES[body]).modes
-        save(train(data, TrainingPlan(Reduced(modes=modes), seconds=seconds)), folder)
-    return load_twin(folder, data.body)
+    modes = Reduced().modes if body == "small" else case(CASES[body]).modes
+    plan = TrainingPlan(Reduced(modes=modes), seconds=seconds)
+    return made.network(RUNS / f"hybrid-{body}-{seconds:g}s", data.body, lambda: train(data, plan))
 
 
 def loads_of(data: DataSet, plan: Plan, count: int) -> dict[str, Floats]:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from harness import Benchmark, Column, Given, Setting, run, verdicts
 from numpy.typing import NDArray
+from summaries import counts
 
 from softtwin.app.identify import together
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS, quickstart_config
@@ -159,8 +160,7 @@ ROWS: dict[str, Callable[[Body, int], dict[str, Any]]] = {
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Over all cases."""
-    verdicts = [row["verdict"] for row in rows]
-    found: dict[str, Any] = {"verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))}}
+    found: dict[str, Any] = {"verdicts": counts(row["verdict"] for row in rows)}
     for name in ("error_mm", "seconds"):
         found[name] = spread([row[name] for row in rows])
     for name in rows[0]["unknowns"]:

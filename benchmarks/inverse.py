@@ -21,6 +21,7 @@ import torch
 from harness import Benchmark, Column, Given, Setting, run
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
+from summaries import counts
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
@@ -279,7 +280,7 @@ def force(body: Body, count: int) -> dict[str, Any]:
     found["seconds"], found["evaluations"] = float(np.mean(spent)), float(np.mean(evaluations))
     found["wrong support"] = {
         name: {
-            "verdicts": {verdict: verdicts.count(verdict) for verdict in sorted(set(verdicts))},
+            "verdicts": counts(verdicts),
             "mean_nodal_m": float(np.mean(misses[name])) if misses[name] else None,
             "accepted_mean_nodal_m": float(np.mean(accepted[name])) if accepted[name] else None,
             "accepted_largest_mean_nodal_m": max(accepted[name], default=None),

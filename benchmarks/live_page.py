@@ -26,6 +26,7 @@ import numpy as np
 import zstandard
 from harness import Benchmark, Column, Setting, cell, run
 from playwright.sync_api import Browser, Page, sync_playwright
+from summaries import resident_mib
 
 CHROMIUM = Path("/usr/bin/chromium")
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
@@ -151,12 +152,6 @@ def rate(heard: Heard, page: Page, seconds: float) -> float:
     return (len(heard.updates) - before) / (time.monotonic() - begin)
 
 
-def memory(process: int) -> float:
-    """Resident memory of a process, MiB."""
-    status = Path(f"/proc/{process}/status").read_text()
-    return int(status.split("VmRSS:")[1].split()[0]) / 1024
-
-
 def cpu_seconds(process: int) -> float:
     """Processor time that a process has used."""
     fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
@@ -189,7 +184,7 @@ def measured(seconds: float) -> dict[str, Any]:
         course = []
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            course.append(memory(process.pid))
+            course.append(resident_mib(process.pid))
             page.wait_for_timeout(min(10_000, 1000 * seconds / 6))
         browser.close()
         time.sleep(2.0)

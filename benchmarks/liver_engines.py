@@ -25,6 +25,7 @@ from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequ
 from numpy.typing import NDArray
 from record import RUNS
 from scipy.stats import chi2
+from summaries import counts, predicted_mm
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.body import Body
@@ -177,7 +178,7 @@ def figures(
         "sequence": data.name,
         "frame": frame,
         "tre_mm": 1e3 * float(errors.mean()),
-        "predicted_mm": 1e3 * float(np.sqrt(8.0 / (3.0 * np.pi)) * known.deviation.mean()),
+        "predicted_mm": predicted_mm(known),
         "force_error": float(np.linalg.norm(missed)) / size if size > 0.0 else None,
         "z2": float(missed @ np.linalg.solve(result.net_force_covariance, missed) / 3.0),
         "covered": {str(share): float((errors <= known.margin(carrier, share) + 1e-12).mean()) for share in SHARES},
@@ -217,11 +218,10 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     done = [row for row in rows if "failed" not in row]
     warm, cold = ([row for row in done if (row["frame"] > 0) is later] for later in (True, False))
     squares = np.array([3.0 * row["z2"] for row in done])
-    verdicts = [row["verdict"] for row in done]
     found: dict[str, Any] = {
         "frames": len(rows),
         "failed": len(rows) - len(done),
-        "verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))},
+        "verdicts": counts(row["verdict"] for row in done),
         "tre_mm": {
             name: float(np.mean([row["tre_mm"] for row in warm if row["sequence"] == name])) for name in SEQUENCES
         },
@@ -252,9 +252,7 @@ def pictures(folder: Path, twin: Path, frames: tuple[int, ...] = (5, 20, 40), na
     data, body = sequence(name), liver()
     shown: dict[str, list[tuple[Floats, Floats]]] = {"truth": [], "reference": [], "surrogate": []}
     for frame in frames:
-        forces = np.zeros_like(body.points)
-        forces[data.tool] = data.net_forces[frame] / len(data.tool)
-        shown["truth"].append((data.positions[frame], forces))
+        shown["truth"].append((data.positions[frame], data.nodal_forces(frame)))
     for engine in ("reference", "surrogate"):
         with registrars(ROWS[engine], twin, 1) as each:
             for frame in frames:

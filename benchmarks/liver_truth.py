@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from harness import Benchmark, Column, Given, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequence
-from numpy.typing import NDArray
 
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.solve.problem import Problem
@@ -19,18 +18,11 @@ MATERIAL = NeoHookean(YOUNG_MODULUS, POISSON_RATIO)
 FRAMES = (0, 25, 49)
 
 
-def tool_forces(data: Sequence, frame: int) -> NDArray[np.float64]:
-    """The true nodal forces of a frame, (n, 3)."""
-    forces = np.zeros_like(data.positions[0])
-    forces[data.tool] = data.net_forces[frame] / len(data.tool)
-    return forces
-
-
 def imbalance(problem: Problem, data: Sequence) -> float:
     """Largest force that is left on a free node over all frames, newtons."""
     largest = 0.0
     for frame, positions in enumerate(data.positions):
-        gap = problem.internal_forces(positions - problem.body.points) - tool_forces(data, frame)
+        gap = problem.internal_forces(positions - problem.body.points) - data.nodal_forces(frame)
         largest = max(largest, float(np.linalg.norm(gap[problem.body.free], axis=1).max()))
     return largest
 
@@ -41,7 +33,7 @@ def attachments(data: Sequence) -> dict[str, Any]:
     for name in ("listed", "facets"):
         body = liver(attachment=name)
         with Problem(body, MATERIAL) as problem:
-            forces = tool_forces(data, 0)
+            forces = data.nodal_forces(0)
             cold = problem.solve(forces)
             warm = problem.solve(forces, guess=data.positions[0] - body.points)
             found[name] = (cold, float(np.abs(cold.displacement - warm.displacement).max()))
@@ -62,7 +54,7 @@ def in_balance(row: str, given: Given) -> dict[str, Any]:
     lone = np.setdiff1d(listed.fixed, problem.body.fixed)
     errors = {}
     for frame in FRAMES:
-        state = problem.solve(tool_forces(data, frame))
+        state = problem.solve(data.nodal_forces(frame))
         errors[f"{row} {frame}"] = np.abs(problem.body.points + state.displacement - data.positions[frame]).max()
         print(f"{row} {frame}: {state.load_steps} load step, {state.negative_pivots} negative pivots")
     return {

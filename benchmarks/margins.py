@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from harness import FOLDER, Benchmark, Column, Given, Setting, run, shares
 from numpy.typing import NDArray
+from summaries import predicted_mm
 
 from softtwin.app.quickstart import CAMERA, POINTS
 from softtwin.app.twin import Twin
@@ -74,7 +75,7 @@ def one(twin: Twin, truth: Floats, noise: float, seed: int) -> dict[str, Any]:
     kept["moved_mm"] = 1e3 * float(np.linalg.norm(truth, axis=1).max())
     kept["nodes"] = {
         "error_mm": 1e3 * float(lengths.mean()),
-        "predicted_mm": 1e3 * float(np.sqrt(8.0 / (3.0 * np.pi)) * known.deviation.mean()),  # mean of a normal's length
+        "predicted_mm": predicted_mm(known),
         "covered": {share: float((lengths <= known.margin(None, share) + 1e-12).mean()) for share in SHARES},
         "drawn_mm": (1e3 * drawn(known, rng)).tolist(),
     }

@@ -24,13 +24,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from harness import RANKS, Benchmark, Column, Given, Setting, run
+from made import beam_data
 from numpy.typing import NDArray
 from record import RUNS
 
-from softtwin.app.chain import prepare
-from softtwin.app.config import Config
-from softtwin.app.launch import generate_in_parallel
-from softtwin.app.stages.mesh import mesh_stage
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples, existing
 from softtwin.reference.data.jacobians import missing_jacobians
@@ -71,11 +68,7 @@ def data_of(kind: str, counts: dict[str, int], ranks: int, seed: int = 0, jacobi
         return made
     if jacobians and made is None and (plain / "data.zarr").exists():
         shutil.copytree(plain, folder)
-    config = Config.model_validate({"folder": ".", "body": {"source": "beam"}, "loads": loads, "samples": samples})
-    space = prepare(config, folder)
-    mesh_stage(space)
-    generate_in_parallel(folder / "organ.toml", ranks)
-    return DataSet(space.data)
+    return beam_data(folder, {"loads": loads, "samples": samples}, ranks)
 
 
 @dataclass(frozen=True)

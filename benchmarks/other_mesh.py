@@ -108,9 +108,7 @@ def frame_of(mesh: OtherMesh, name: str, frame: int) -> dict[str, Any]:
     """One frame."""
     data = sequence(name, "remeshed")
     wanted = data.positions[frame] - mesh.truth.points
-    true = np.zeros_like(mesh.truth.points)
-    true[data.tool] = data.net_forces[frame] / len(data.tool)
-    state = mesh.model.solve(mesh.carried(true))
+    state = mesh.model.solve(mesh.carried(data.nodal_forces(frame)))
     least, steps = mesh.best(wanted, data.zone)
     return {
         "sequence": name,

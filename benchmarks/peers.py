@@ -504,10 +504,8 @@ def _cases() -> Iterator[tuple[str, Body, str, float, float, Floats]]:
     pull = np.zeros_like(bar.points)
     pull[tip, 2] = 1.0 / len(tip)
     yield "beam", bar, "neo-hookean", 5000.0, 0.45, pull
-    organ, data = liver(), sequence("s2")
-    push = np.zeros_like(organ.points)
-    push[data.tool] = data.net_forces[0] / len(data.tool)
-    yield "liver", organ, "neo-hookean", YOUNG_MODULUS, POISSON_RATIO, push
+    push = sequence("s2").nodal_forces(0)
+    yield "liver", liver(), "neo-hookean", YOUNG_MODULUS, POISSON_RATIO, push
     yield "beam", bar, "saint-venant-kirchhoff", 5000.0, 0.3, 0.6 * pull
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from harness import FOLDER, Benchmark, Column, Given, Setting, run, verdicts
 from margins import truths_of
 from numpy.typing import NDArray
+from summaries import counts
 
 from softtwin.app.quickstart import CAMERA, POINTS
 from softtwin.app.twin import Twin
@@ -56,9 +57,8 @@ def one(twin: Twin, load: Floats, truth: Floats, seed: int) -> dict[str, Any]:
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Over all frames with a result."""
-    used, verdicts = [row for row in rows if row["verdict"] != "none"], [row["verdict"] for row in rows]
-    counts = {name: verdicts.count(name) for name in sorted(set(verdicts))}
-    found: dict[str, Any] = {"loads": len(rows), "verdicts": counts}
+    used = [row for row in rows if row["verdict"] != "none"]
+    found: dict[str, Any] = {"loads": len(rows), "verdicts": counts(row["verdict"] for row in rows)}
     for name in ("error_mm", "forces_off", "net_off", "seconds"):
         values = np.array([row[name] for row in used])
         found[name] = {"mean": values.mean(), "median": np.median(values), "p95": np.quantile(values, 0.95)}

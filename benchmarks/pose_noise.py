@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from record import RUNS
 from robustness import forward_model, registrar_for
 from scipy.spatial.transform import Rotation
+from summaries import counts
 
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.forward import ForwardModel
@@ -74,7 +75,7 @@ def level(registrar: Any, clean: Any, body: Any, s: float, draws: int, has_pose:
         "force_error": spread(np.array(off)),
         "z_rms": float(np.sqrt(np.mean(z2))),
         "median_seconds": float(np.median(seconds)),
-        "verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))},
+        "verdicts": counts(verdicts),
     }
 
 

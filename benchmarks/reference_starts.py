@@ -41,13 +41,7 @@ def timed(name: str, solve: Callable[[], ReferenceState]) -> tuple[dict[str, Any
 
 def steps(model: ReferenceModel, name: str) -> list[dict[str, Any]]:
     """The steps of one sequence."""
-    data, body = sequence(name), model.body
-
-    def forces(frame: int, share: float = 1.0) -> np.ndarray:
-        field = np.zeros_like(body.points)
-        field[data.tool] = share * data.net_forces[frame] / len(data.tool)
-        return field
-
+    forces, body = sequence(name).nodal_forces, model.body
     row, pulled = timed("cold", lambda: model.solve(forces(49)))
     rows = [row]
     if pulled is None:

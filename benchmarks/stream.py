@@ -18,6 +18,7 @@ import numpy as np
 from harness import FOLDER, Benchmark, Given, Setting, run
 from margins import truths_of
 from numpy.typing import NDArray
+from summaries import resident_mib
 
 from softtwin.app.live import answers
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS
@@ -28,12 +29,6 @@ from softtwin.meshes.metrics import nodal_distances
 
 Floats = NDArray[np.float64]
 STATES, BETWEEN = 8, 60  # frames from one state to the next
-
-
-def resident_mib() -> float:
-    """Memory that this process holds."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * 4096 / 2**20
 
 
 def path_of(folder: Path) -> list[Floats]:

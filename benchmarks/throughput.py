@@ -20,6 +20,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import made
 import numpy as np
 from harness import Benchmark, Column, Given, Setting, run, started
 from networks_bodies import data_of, liver, tetrahedral_liver
@@ -32,7 +33,7 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
-from softtwin.surrogate.twin import CARD, load, save
+from softtwin.surrogate.twin import load
 
 HELD_OUT, WANTED = 16, 20480
 
@@ -44,8 +45,8 @@ NETWORK = RUNS / "throughput-network"
 
 def trained(ranks: int, seconds: float) -> None:
     """The network that solves may start from; what is there is not made again."""
-    if not (NETWORK / CARD).exists():
-        save(train(data_of("liver", ranks), TrainingPlan(Reduced(), seconds=seconds, samples=1024)), NETWORK)
+    plan = TrainingPlan(Reduced(), seconds=seconds, samples=1024)
+    made.network(NETWORK, liver(), lambda: train(data_of("liver", ranks), plan))
 
 
 @cache
