@@ -17,7 +17,8 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from harness import Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from liver import SEQUENCES, liver, sequence
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

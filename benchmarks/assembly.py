@@ -10,7 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from harness import Benchmark, Column, Setting, run
+from columns import Column
+from harness import Benchmark, Setting, run
 from liver import POISSON_RATIO, YOUNG_MODULUS, liver
 
 from softtwin.meshes.body import Body

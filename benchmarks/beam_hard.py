@@ -12,7 +12,8 @@ import time
 from typing import Any
 
 import numpy as np
-from harness import Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body

@@ -23,7 +23,8 @@ from typing import Any
 import made
 import numpy as np
 import torch
-from harness import RANKS, Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from inverse import cloud_of
 from networks_bodies import case, data_of
 from numpy.typing import NDArray

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import RANKS, Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from made import beam_data
 from record import RUNS
 

@@ -24,7 +24,8 @@ from typing import Any
 
 import numpy as np
 from beam_registration import BODY, MODULUS, RATIO, network_of
-from harness import RANKS, Benchmark, Column, Given, Setting, run, shares, verdicts
+from columns import Column, shares, verdicts
+from harness import RANKS, Benchmark, Given, Setting, run
 from liver import POISSON_RATIO, YOUNG_MODULUS, liver
 from networks_bodies import data_of
 from numpy.typing import NDArray

@@ -16,7 +16,8 @@ from typing import Any
 
 import made
 import numpy as np
-from harness import RANKS, Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from networks import data_of as small_data
 from networks_bodies import case, data_of
 from record import RUNS

@@ -15,7 +15,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from certificates import network_of
-from harness import RANKS, Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from hybrid_newton import RANGES, STEPS, Way, alone, figures_of, loads_of, reference_way, stepped_way
 from networks import data_of as small_data
 from networks import judged

@@ -16,7 +16,8 @@ import time
 from typing import Any
 
 import numpy as np
-from harness import Benchmark, Column, Given, Setting, run, started
+from columns import Column
+from harness import Benchmark, Given, Setting, run, started
 from mpi4py import MPI
 
 from softtwin.meshes.shapes import beam

@@ -23,7 +23,8 @@ from typing import Any
 import made
 import numpy as np
 import torch
-from harness import RANKS, Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from networks import data_of as small_data
 from networks_bodies import case
 from networks_bodies import data_of as body_data

@@ -16,7 +16,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from harness import Benchmark, Column, Given, Setting, run, verdicts
+from columns import Column, verdicts
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
 from summaries import counts
 

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 from summaries import counts

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from harness import RANKS, Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from networks_bodies import data_of
 
 from softtwin.meshes.metrics import relative_error

@@ -24,7 +24,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import zstandard
-from harness import Benchmark, Column, Setting, cell, run
+from columns import Column, cell
+from harness import Benchmark, Setting, run
 from playwright.sync_api import Browser, Page, sync_playwright
 from summaries import resident_mib
 

@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import RANKS, Benchmark, Column, Given, Setting, run, shares, started, verdicts
+from columns import Column, shares, verdicts
+from harness import RANKS, Benchmark, Given, Setting, run, started
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequence
 from numpy.typing import NDArray
 from record import RUNS

@@ -8,7 +8,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from harness import Benchmark, Column, Given, run
+from columns import Column
+from harness import Benchmark, Given, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequence
 
 from softtwin.reference.data.materials import NeoHookean

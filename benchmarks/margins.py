@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import FOLDER, Benchmark, Column, Given, Setting, run, shares
+from columns import Column, shares
+from harness import FOLDER, Benchmark, Given, Setting, run
 from numpy.typing import NDArray
 from summaries import predicted_mm
 

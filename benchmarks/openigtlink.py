@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
 from pyigtl.messages import CRC64, PointMessage
 

@@ -13,7 +13,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from harness import Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, kron

@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import FOLDER, Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import FOLDER, Benchmark, Given, Setting, run
 from margins import truths_of
 from numpy.typing import NDArray
 

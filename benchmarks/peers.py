@@ -22,7 +22,8 @@ import numpy as np
 import scipy.sparse as sp
 import skfem
 import torch
-from harness import Benchmark, Column, Given, run
+from columns import Column
+from harness import Benchmark, Given, run
 from liver import POISSON_RATIO, YOUNG_MODULUS, liver, sequence
 from numpy.typing import ArrayLike, NDArray
 from pypardiso import PyPardisoSolver

@@ -15,7 +15,8 @@ import time
 from typing import Any
 
 import numpy as np
-from harness import FOLDER, Benchmark, Column, Given, Setting, run, verdicts
+from columns import Column, verdicts
+from harness import FOLDER, Benchmark, Given, Setting, run
 from margins import truths_of
 from numpy.typing import NDArray
 from summaries import counts

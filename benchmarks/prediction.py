@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from networks import CHANNELS, data_of
 from numpy.typing import NDArray
 

@@ -12,7 +12,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from harness import FOLDER, Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import FOLDER, Benchmark, Given, Setting, run
 from numpy.typing import NDArray
 
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS  # what its own cloud is made with

@@ -22,7 +22,8 @@ from typing import Any
 import nibabel
 import numpy as np
 import pyvista
-from harness import Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
 from surfaces import SURFACES, surface_of
 from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import Benchmark, Column, Given, Setting, run
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.files import Unit, read_mesh

@@ -22,7 +22,8 @@ from typing import Any
 
 import made
 import numpy as np
-from harness import Benchmark, Column, Given, Setting, run, started
+from columns import Column
+from harness import Benchmark, Given, Setting, run, started
 from networks_bodies import data_of, liver, tetrahedral_liver
 from record import RUNS
 

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from harness import Benchmark, Given, markdown, run
+from columns import markdown
+from harness import Benchmark, Given, run
 from record import recorded
 from verification_cases import PLANE, QUADRATIC, SPACE, compressible, incompressible
 from verification_derivatives import STEPS, frame, tangent, taylor, taylor_cases

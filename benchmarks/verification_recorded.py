@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from harness import markdown
+from columns import markdown
 from record import recorded
 
 PEERS = ("felupe", "scikit-fem", "torch-fem")

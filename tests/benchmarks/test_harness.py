@@ -6,10 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import audit
+import columns
 import harness
 import pytest
 import record
-from harness import Benchmark, Column, Given, Setting
+from columns import Column
+from harness import Benchmark, Given, Setting
 from repository import Repository
 
 SCRIPT = """
@@ -137,9 +140,9 @@ def test_a_small_run_is_not_recorded(repository: Repository, capsys: pytest.Capt
 def test_the_table_is_that_of_the_record(repository: Repository, capsys: pytest.CaptureFixture[str]) -> None:
     counted = Counted()
     counted.run()
-    printed = harness.tables_of(capsys.readouterr().out)
+    printed = columns.tables_of(capsys.readouterr().out)
     assert counted.run("--table") == []
-    assert harness.tables_of(capsys.readouterr().out) == printed
+    assert columns.tables_of(capsys.readouterr().out) == printed
     assert printed["squares_whole"].splitlines()[::2] == [
         "| squares_whole | square, m2 | absent |",
         "| two | 40.0 | - |",
@@ -178,7 +181,7 @@ def test_what_rows_share_is_made_once_and_closed(repository: Repository) -> None
 
 
 def states() -> dict[str, tuple[str, int, int]]:
-    return {each.record: (each.state, each.rows, each.of) for each in harness.audit()}
+    return {each.record: (each.state, each.rows, each.of) for each in audit.audit()}
 
 
 def test_what_is_older_than_its_code_is_stale_row_by_row(repository: Repository) -> None:
@@ -189,7 +192,7 @@ def test_what_is_older_than_its_code_is_stale_row_by_row(repository: Repository)
     assert states() == {}
     repository.commit("the organ", **{"organ/liver.py": "3"})
     assert states() == {"squares_whole": ("older", 3, 3)}
-    assert "organ changed in" in str(harness.audit()[0])
+    assert "organ changed in" in str(audit.audit()[0])
     counted.run("--only", "two")
     assert states() == {"squares_whole": ("older", 2, 3)}
     counted.run()
@@ -224,10 +227,10 @@ def test_orphans_dirty_and_unknown_records_are_told(repository: Repository) -> N
 def test_a_declaration_that_cannot_be_read_from_its_source_is_an_error(repository: Repository) -> None:
     repository.write("benchmarks/cubes.py", 'Benchmark(name=f"{1}", title="", about=("organ",))')
     with pytest.raises(ValueError, match=r"cubes\.py: name: expected a literal"):
-        harness.declarations()
+        audit.declarations()
     repository.write("benchmarks/cubes.py", 'Benchmark(name="cubes", title="", about=("organs",))')
     with pytest.raises(ValueError, match=r"cubes\.py: about: no such files: organs"):
-        harness.declarations()
+        audit.declarations()
 
 
 def test_declarations_are_checked_when_they_are_made() -> None:
@@ -238,7 +241,7 @@ def test_declarations_are_checked_when_they_are_made() -> None:
 
 
 def test_every_script_here_declares_what_it_records() -> None:
-    declared = harness.declarations()
+    declared = audit.declarations()
     assert len(declared) > 40
     for each in declared:
         assert each.title and not each.title.endswith("."), each.script
