@@ -244,6 +244,7 @@ def _all_rows(benchmark: Benchmark, name: str, options: argparse.Namespace, comm
                 made[row] = {"commit": record.commit(), "date": time.strftime("%Y-%m-%d"), "command": command}
                 made[row] |= {"seconds": round(seconds, 2), "settings": _as_json(kept), "seeds": list(benchmark.seeds)}
                 made[row] |= {"on": record.processor(), "gpu": record.gpu()}
+                made = record.made_of({**known, "figures": figures, "made": made}, benchmark.under)
                 record.write(name, figures, made, command)
     print(table(benchmark, name, figures))
     print("nothing is recorded (--dry)" if is_dry else f"recorded: benchmarks/results/{name}.json")

@@ -118,12 +118,13 @@ def made_of(record: dict[str, Any], under: str = "") -> dict[str, dict[str, Any]
     figures = record.get("figures", {})
     rows = figures.get(under, {}) if under else figures
     rows = rows if isinstance(rows, dict) else {}
-    own = {
-        name: row["made"] for name, row in rows.items() if isinstance(row, dict) and isinstance(row.get("made"), dict)
-    }
-    found = {**own, **{name: each for name, each in record.get("made", {}).items() if name in rows or name == ""}}
+    told = {name: row["made"] for name, row in rows.items() if isinstance(row, dict) and "made" in row}
+    told |= {name: made for name, made in record.get("made", {}).items() if name in rows or not name}
+    silent = [name for name, row in rows.items() if name not in told and (under or isinstance(row, dict))]
     whole = {name: record[name] for name in ("commit", "date", "command") if name in record}
-    return found if found and all(name in found for name in rows) else {**found, "": found.get("", whole)}
+    if silent or not rows or not told:
+        return {"": whole, **told}
+    return {name: made for name, made in told.items() if name} or told
 
 
 def write(name: str, figures: Any, made: dict[str, Any], command: str) -> Path:

@@ -224,6 +224,44 @@ def test_orphans_dirty_and_unknown_records_are_told(repository: Repository) -> N
     }
 
 
+def test_rows_of_before_are_told_apart_from_those_made_since(repository: Repository) -> None:
+    here = repository.git("rev-parse", "--short", "HEAD")
+    old = {
+        "benchmark": "squares_whole",
+        "commit": f"{here}-dirty",
+        "date": "2026-11-21",
+        "command": "python squares.py",
+    }
+    rows = {"two": {"square": 1.0}, "three": {"square": 1.0}, "twenty": {"square": 1.0}}
+    (repository.results / "squares_whole.json").write_text(json.dumps({**old, "figures": rows}))
+    counted = Counted()
+    assert counted.run("--only", "two") == ["two"]
+    found = record.read("squares_whole")
+    assert found["figures"] == {**rows, "two": {"square": 4.0}}
+    assert found["made"][""] == {name: old[name] for name in ("commit", "date", "command")}
+    assert [str(each).split()[:3] for each in audit.audit()] == [["squares_whole", "dirty", "1"]]
+    assert counted.run() == ["three", "twenty"]
+    assert states() == {} and set(record.read("squares_whole")["made"]) == set(rows)
+
+
+def test_figures_of_one_row_are_recorded_and_kept_as_a_whole(repository: Repository) -> None:
+    made = []
+
+    def work(row: str, given: Given) -> dict[str, Any]:
+        made.append(row)
+        return {"seconds": 1.0, "stages": {"mesh": 1.0}}
+
+    whole = Benchmark("squares_whole", "Squares", ("organ",), work)
+    harness.run(whole, [])
+    harness.run(whole, [])
+    assert made == [""] and record.recorded("squares_whole") == {"seconds": 1.0, "stages": {"mesh": 1.0}}
+    assert states() == {}
+    repository.commit("the organ", **{"organ/liver.py": "4"})
+    assert states() == {"squares_whole": ("older", 1, 0)}
+    harness.run(whole, [])
+    assert made == ["", ""]
+
+
 def test_a_declaration_that_cannot_be_read_from_its_source_is_an_error(repository: Repository) -> None:
     repository.write("benchmarks/cubes.py", 'Benchmark(name=f"{1}", title="", about=("organ",))')
     with pytest.raises(ValueError, match=r"cubes\.py: name: expected a literal"):
