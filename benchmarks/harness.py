@@ -175,11 +175,11 @@ def run(
         return record.recorded(name)
     is_dry = options.dry or getattr(options, "small", False)
     try:
-        if not is_dry:
-            record.commit()
+        begun = "" if is_dry else record.commit()
+        if begun:
             record.check_clean()
         command = " ".join(["python", f"benchmarks/{benchmark.script.name}", *words])
-        return _all_rows(benchmark, name, options, command, is_dry)
+        return _all_rows(benchmark, name, options, command, begun)
     except record.NotRecordedError as error:
         raise SystemExit(f"{name}: {error}") from None
 
@@ -215,10 +215,10 @@ def _add(parser: argparse.ArgumentParser, name: str, setting: Setting) -> None:
     parser.add_argument(flag, **told)
 
 
-def _all_rows(benchmark: Benchmark, name: str, options: argparse.Namespace, command: str, is_dry: bool) -> Figures:
+def _all_rows(benchmark: Benchmark, name: str, options: argparse.Namespace, command: str, begun: str) -> Figures:
     from threadpoolctl import threadpool_limits
 
-    known = {} if is_dry else record.read(name)
+    known = record.read(name) if begun else {}
     figures, made = known.get("figures", {}), record.made_of(known, benchmark.under) if known else {}
     settings = {each: getattr(options, each) for each in benchmark.settings}
     kept = {each: value for each, value in settings.items() if not benchmark.settings[each].picks}
@@ -228,26 +228,26 @@ def _all_rows(benchmark: Benchmark, name: str, options: argparse.Namespace, comm
         for place, row in enumerate(wanted):
             label = f"[{place + 1}/{len(wanted)}] {row or name}"
             told = made.get(row, {}) if row in made or not row else made.get("", {})
-            if not (is_dry or options.fresh) and _is_current(benchmark, figures, row, told, kept):
+            if begun and not options.fresh and _is_current(benchmark, figures, row, told, kept):
                 print(f"{label}: recorded at {told['commit']}", flush=True)
                 continue
             print(f"{label} ...", flush=True)
-            begun = time.perf_counter()
+            clock = time.perf_counter()
             found = _as_json(benchmark.work(row, given))
-            seconds = time.perf_counter() - begun
+            seconds = time.perf_counter() - clock
             figures = _with(benchmark, figures, row, found)
             print(f"{label}: {seconds:.1f} s; {_line(benchmark, row, found)}", flush=True)
             if benchmark.finish is not None:
                 figures |= _as_json(benchmark.finish(figures, given))
-            if not is_dry:
-                record.check_clean([*benchmark.about, "benchmarks"])
-                made[row] = {"commit": record.commit(), "date": time.strftime("%Y-%m-%d"), "command": command}
+            if begun:
+                record.check_unchanged(begun, [*benchmark.about, "benchmarks"])
+                made[row] = {"commit": begun, "date": time.strftime("%Y-%m-%d"), "command": command}
                 made[row] |= {"seconds": round(seconds, 2), "settings": _as_json(kept), "seeds": list(benchmark.seeds)}
                 made[row] |= {"on": record.processor(), "gpu": record.gpu()}
                 made = record.made_of({**known, "figures": figures, "made": made}, benchmark.under)
-                record.write(name, figures, made, command)
+                record.write(name, figures, made, command, begun)
     print(table(benchmark, name, figures))
-    print("nothing is recorded (--dry)" if is_dry else f"recorded: benchmarks/results/{name}.json")
+    print(f"recorded: benchmarks/results/{name}.json" if begun else "nothing is recorded (--dry)")
     return figures
 
 

@@ -78,6 +78,17 @@ def check_clean(paths: Sequence[str] = (".",)) -> None:
         )
 
 
+def check_unchanged(begun: str, paths: Sequence[str]) -> None:
+    """Refuse what was measured while files below some paths changed, committed or not.
+
+    Raises:
+        NotRecordedError: they differ from the commit that the run began at.
+    """
+    check_clean(paths)
+    if git("diff", "--quiet", begun, "HEAD", "--", *paths, ":(exclude)benchmarks/results") is None:
+        raise NotRecordedError(f"A commit changed {', '.join(paths)} while this ran from {begun}: run it again.")
+
+
 @cache
 def last_change(about: tuple[str, ...]) -> str:
     """The last commit that touched some folders or files; the present one where none ever did."""
@@ -127,7 +138,7 @@ def made_of(record: dict[str, Any], under: str = "") -> dict[str, dict[str, Any]
     return {name: made for name, made in told.items() if name} or told
 
 
-def write(name: str, figures: Any, made: dict[str, Any], command: str) -> Path:
+def write(name: str, figures: Any, made: dict[str, Any], command: str, begun: str) -> Path:
     """Write a record, whole or not at all; returns the file.
 
     Args:
@@ -135,10 +146,11 @@ def write(name: str, figures: Any, made: dict[str, Any], command: str) -> Path:
         figures: of all rows.
         made: what each row is made from.
         command: that was given.
+        begun: the commit that it ran at.
     """
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{name}.json"
-    told = {"benchmark": name, "date": time.strftime("%Y-%m-%d"), "command": command, "commit": commit()}
+    told = {"benchmark": name, "date": time.strftime("%Y-%m-%d"), "command": command, "commit": begun}
     record = {**told, "machine": machine(), "figures": figures, "made": made}
     partly = path.with_suffix(".part")
     partly.write_text(json.dumps(record, indent=1, default=plain) + "\n")

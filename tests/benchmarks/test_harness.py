@@ -79,18 +79,21 @@ def test_a_tree_with_uncommitted_changes_is_refused_before_anything_runs(reposit
     assert not list(repository.results.iterdir())
 
 
-def test_code_that_changes_under_a_run_is_not_recorded(repository: Repository) -> None:
+@pytest.mark.parametrize("change", ["write", "commit"])
+def test_code_that_changes_under_a_run_is_not_recorded(repository: Repository, change: str) -> None:
     counted = Counted()
 
     def work(row: str, given: Given) -> dict[str, Any]:
-        if row == "three":
+        if row == "three" and change == "write":
             repository.write("organ/liver.py", "changed meanwhile")
+        if row == "three" and change == "commit":
+            repository.commit("meanwhile", **{"organ/liver.py": "committed meanwhile"})
         return {"square": 0.0}
 
     changing = Benchmark(
         "squares_{kind}", "Squares", ("organ",), work, ("two", "three"), settings=counted.benchmark.settings
     )
-    with pytest.raises(SystemExit, match=r"organ/liver\.py"):
+    with pytest.raises(SystemExit, match=r"organ/liver\.py|A commit changed organ"):
         harness.run(changing, [])
     assert list(record.recorded("squares_whole")) == ["two"]
 
@@ -197,6 +200,20 @@ def test_what_is_older_than_its_code_is_stale_row_by_row(repository: Repository)
     assert states() == {"squares_whole": ("older", 2, 3)}
     counted.run()
     assert states() == {}
+
+
+def test_list_and_stale_are_printed(repository: Repository, capsys: pytest.CaptureFixture[str]) -> None:
+    harness.main(["stale"])
+    assert capsys.readouterr().out == "every record is of the last commit of what it is about\n"
+    Counted().run("--only", "two")
+    here = repository.commit("the organ", **{"organ/liver.py": "5"})
+    capsys.readouterr()
+    harness.main(["list"])
+    listed = capsys.readouterr().out
+    assert "squares.py" in listed and "Squares" in listed and "about organ" in listed and "squares_whole: " in listed
+    harness.main(["stale"])
+    told = capsys.readouterr().out
+    assert told.split()[:6] == ["squares_whole", "older", "1", "of", "1", "rows"] and here[:7] in told
 
 
 def test_orphans_dirty_and_unknown_records_are_told(repository: Repository) -> None:
