@@ -1,6 +1,7 @@
 """Registration of the real liver with a surrogate: the same frames, truth and metrics as with the reference.
 
     python benchmarks/registration_surrogate.py [--ranks 2] [--seconds 300] [--draws 1360] [--frames 50]
+    python benchmarks/registration_surrogate.py twin 320      # the twin alone, for liver_engines.py and others
 
 Makes the data set under benchmarks/runs/liver where it is not there, and trains the twin.
 """
@@ -63,6 +64,11 @@ def made_twin(seconds: float, ranks: int, folder: Path, draws: int) -> Workspace
     return space
 
 
+def twin_alone(draws: str, seconds: str = "270") -> None:
+    """Make the twin where others look for it, and register nothing."""
+    made_twin(float(seconds), RANKS.default, RUNS / "liver", int(draws))
+
+
 def learned(given: Given) -> Surrogate:
     """The twin that is given, or one that is made."""
     folder = given.twin or made_twin(given.seconds, given.ranks, given.folder, given.draws).twin
@@ -102,4 +108,4 @@ BENCHMARK = Benchmark(
 
 
 if __name__ == "__main__":
-    run(BENCHMARK)
+    run(BENCHMARK, parts={"twin": twin_alone})
