@@ -241,14 +241,26 @@ def _all_rows(benchmark: Benchmark, name: str, options: argparse.Namespace, comm
                 figures |= _as_json(benchmark.finish(figures, given))
             if begun:
                 record.check_unchanged(begun, [*benchmark.about, "benchmarks"])
-                made[row] = {"commit": begun, "date": time.strftime("%Y-%m-%d"), "command": command}
-                made[row] |= {"seconds": round(seconds, 2), "settings": _as_json(kept), "seeds": list(benchmark.seeds)}
-                made[row] |= {"on": record.processor(), "gpu": record.gpu()}
+                made[row] = _made(benchmark, begun, command, seconds, kept)
                 made = record.made_of({**known, "figures": figures, "made": made}, benchmark.under)
                 record.write(name, figures, made, command, begun)
     print(table(benchmark, name, figures))
     print(f"recorded: benchmarks/results/{name}.json" if begun else "nothing is recorded (--dry)")
     return figures
+
+
+def _made(benchmark: Benchmark, begun: str, command: str, seconds: float, kept: Figures) -> Figures:
+    """What a row is made from."""
+    return {
+        "commit": begun,
+        "date": time.strftime("%Y-%m-%d"),
+        "command": command,
+        "seconds": round(seconds, 2),
+        "settings": _as_json(kept),
+        "seeds": list(benchmark.seeds),
+        "on": record.processor(),
+        "gpu": record.gpu(),
+    }
 
 
 def _chosen(benchmark: Benchmark, given: Given, only: Sequence[str]) -> list[str]:
