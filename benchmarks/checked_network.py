@@ -44,7 +44,7 @@ def solved(data: DataSet, plan: Plan, network: Surrogate, problem: Problem, coun
             way(loads[0])  # what is factored once
         taken = [{label: alone(problem, way, load) for label, way in ways.items()} for load in loads]
         truth = [each[f"{STEPS} load steps"].displacement for each in taken]
-        found[name] = {label: figures_of([each[label] for each in taken], truth) for label in ways}
+        found[name] = {label: figures_of(problem, [each[label] for each in taken], truth) for label in ways}
         print(name, found[name], flush=True)
     assert list(found) == list(RANGES)
     return found
