@@ -1,6 +1,6 @@
 """Material beside forces on the quickstart's phantom: force / E with Poisson's ratio; a stiff tumour and the rest.
 
-    python benchmarks/inclusion.py [--count 20] [--rows ...]
+    python benchmarks/inclusion.py [--count 20] [--only ROW ...]
 
 A pull on a patch of the seen side, another one each case, moves the organ by up to 24 mm; for the tumour the patch lies
 above it, as where a surgeon feels for one. The cloud is the quickstart camera's, 1,000 points with 0.5 mm of noise;
@@ -12,14 +12,14 @@ verdicts. Reference engine, from rest. Refused frames are counted and are in the
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from columns import Column, verdicts
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
-from record import recorded, stamp, write
-from threadpoolctl import threadpool_limits
+from summaries import counts
 
 from softtwin.app.identify import together
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS, quickstart_config
@@ -38,7 +38,6 @@ from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-NAME = "inclusion"
 MODULUS, RATIO, MOVED = 5000.0, 0.45, 0.024  # pascals; metres that the largest node moves
 KNOWN, STIFFER = 0.3, (2.0, 8.0)  # deviation of the logarithm of the rest's modulus; times as stiff as the rest
 TOOL, ZONE, ABOVE = 0.03, 0.05, 0.01  # radii of the patch and of the zone, how far off the tumour it lies, metres
@@ -162,8 +161,7 @@ ROWS: dict[str, Callable[[Body, int], dict[str, Any]]] = {
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Over all cases."""
-    verdicts = [row["verdict"] for row in rows]
-    found: dict[str, Any] = {"verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))}}
+    found: dict[str, Any] = {"verdicts": counts(row["verdict"] for row in rows)}
     for name in ("error_mm", "seconds"):
         found[name] = spread([row[name] for row in rows])
     for name in rows[0]["unknowns"]:
@@ -182,21 +180,32 @@ def spread(values: list[float]) -> dict[str, float]:
     return {"mean": float(np.mean(values)), "median": float(np.median(values)), "largest": float(np.max(values))}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=20, help="cases of each row")
-    parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=list(ROWS))
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found, body = recorded(arguments.name), liver_phantom(quickstart_config(False).body.cell_size)
-    for label in arguments.rows:
-        if found.get(label, {}).get("count") != arguments.count:
-            with threadpool_limits(1):
-                rows = [ROWS[label](body, seed) for seed in range(arguments.count)]
-            found[label] = {"count": arguments.count, "summary": summary(rows), "cases": rows, "made": stamp()}
-            write(arguments.name, found)
-        print(label, found[label]["summary"], sep="\n  ", flush=True)
+def work(row: str, given: Given) -> dict[str, Any]:
+    body = given.once(liver_phantom, quickstart_config(False).body.cell_size)
+    cases = [ROWS[row](body, seed) for seed in range(given.count)]
+    return {"count": given.count, "summary": summary(cases), "cases": cases}
+
+
+BENCHMARK = Benchmark(
+    name="inclusion",
+    title="Material beside forces on the phantom: force / E with Poisson's ratio; a stiff tumour and the rest",
+    about=("registration", "reference"),
+    work=work,
+    rows=tuple(ROWS),
+    columns=(
+        Column("accepted; doubtful; refused", "", verdicts),
+        Column("mean nodal error", "mm", "{error_mm.mean:.2f}"),
+        *(
+            Column(f"{name}: off; within 90 %", "%", f"{{{name}.off.median*100:.0f}}; {{{name}.within_90*100:.0f}}")
+            for name in ("force / E", "Young's modulus", "Young's modulus of tumour", "Poisson's ratio")
+        ),
+        Column("median", "s", "{seconds.median:.1f}"),
+    ),
+    settings={"count": Setting(20, "cases of each row")},
+    small={"count": 1},
+    lines=lambda rows: ((name, found["summary"]) for name, found in rows.items()),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

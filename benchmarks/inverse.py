@@ -9,7 +9,6 @@ Every case counts: one that ends elsewhere or not at all is a failure of its row
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Iterator
@@ -19,10 +18,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
-from record import recorded, write
 from scipy.sparse.linalg import splu
-from threadpoolctl import threadpool_limits
+from summaries import counts
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
@@ -49,7 +49,6 @@ from softtwin.registration.verdict import Verdict
 from softtwin.surrogate.residual import ElasticBody
 
 Floats = NDArray[np.float64]
-NAME = "inverse"
 MODULUS, RATIO, AMPLITUDE = 4500.0, 0.49, 0.03
 TIGHT = NewtonOptions(tolerance=1e-12)
 EXACT = Scale(1e-9, 0.0, least=1e-9)  # metres: clouds without noise
@@ -282,7 +281,7 @@ def force(body: Body, count: int) -> dict[str, Any]:
     found["seconds"], found["evaluations"] = float(np.mean(spent)), float(np.mean(evaluations))
     found["wrong support"] = {
         name: {
-            "verdicts": {verdict: verdicts.count(verdict) for verdict in sorted(set(verdicts))},
+            "verdicts": counts(verdicts),
             "mean_nodal_m": float(np.mean(misses[name])) if misses[name] else None,
             "accepted_mean_nodal_m": float(np.mean(accepted[name])) if accepted[name] else None,
             "accepted_largest_mean_nodal_m": max(accepted[name], default=None),
@@ -385,21 +384,60 @@ TABLES = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tables", nargs="+", default=list(TABLES), choices=list(TABLES))
-    parser.add_argument("--count", type=int, help="loads, fewer than the table's, for a look")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found, body = recorded(arguments.name), beam()
-    for name in arguments.tables:
-        run, count = TABLES[name]
-        if name not in found:
-            with threadpool_limits(1):
-                found[name] = run(body, arguments.count or count)
-            write(arguments.name, found)
-        print(name, found[name], sep="\n  ", flush=True)
+def work(row: str, given: Given) -> dict[str, Any]:
+    run_table, count = TABLES[row]
+    return run_table(beam(), given.count or count)
+
+
+_CONTROLS = {
+    "stiffness": ("modulus_off", "within_1e-8"),
+    "ratio": ("ratio_off", "within_1e-5"),
+    "both": ("modulus_off", "within_1e-5"),
+}
+
+
+def lines(rows: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """What is off at the end, in the mean and at most, one line for each control and start."""
+    for name, found in rows.items():
+        if name == "exactness":
+            asked = f"{100 * found['share_within_1e-9']:.0f} % of nodes' largest"
+            yield name, {**found["distance"], "loads": found["loads"], "asked": asked,
+                         "seconds": found["seconds_a_load"]["layer"]}  # fmt: skip
+        elif name in _CONTROLS:
+            off, asked = _CONTROLS[name]
+            yield name, {**found["found"], "off": found["found"][off], "loads": found["loads"],
+                         "asked": found[asked], "seconds": found["seconds"]}  # fmt: skip
+        elif name == "force":
+            asked = f"all but {len(found['failed'])} of {found['loads']}"
+            for start, each in found["starts"].items():
+                yield f"force from {start}", {**each, "off": each["force_off"], "loads": found["loads"] // 2,
+                                              "asked": asked, "seconds": found["seconds"]}  # fmt: skip
+
+
+BENCHMARK = Benchmark(
+    name="inverse",
+    title="The thesis's differentiable engine (section 7.2): exactness; force, stiffness and ratio as controls",
+    about=("registration", "reference"),
+    work=work,
+    rows=lambda given: given.tables,
+    columns=(
+        Column("loads", "", "{loads}"),
+        Column("as asked", "", "{asked}"),
+        Column("mean nodal (largest)", "m", "{mean.mean:.1e} ({mean.largest:.1e})"),
+        Column("norm / nodes", "m", "{norm_over_nodes.mean:.1e}"),
+        Column("control off, relative", "", "{off.mean:.1e} ({off.largest:.1e})"),
+        Column("a load", "s", "{seconds:.2f}"),
+    ),
+    settings={
+        "tables": Setting(tuple(TABLES), choices=tuple(TABLES), picks=True),
+        "count": Setting(None, "loads, fewer than the table's, for a look", kind=int),
+    },
+    seeds=(0,),
+    small={"count": 2},
+    lines=lines,
+    also=("inverse_exactness",),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

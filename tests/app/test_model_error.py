@@ -15,8 +15,8 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 pytest.importorskip("torch", reason="torch is absent")
 
 from softtwin.app.config import ConfigError
-from softtwin.app.stages.model_error import model_error_stage, is_current
-from softtwin.app.twin import FORMER_MODEL_ERROR, MODEL_ERROR, Twin, find_twin, forward_models
+from softtwin.app.stages.model_error import is_current, model_error_stage
+from softtwin.app.twin import MODEL_ERROR, Twin, find_twin, forward_models
 from softtwin.app.workspace import open_workspace
 from softtwin.meshes.files import read_body
 from softtwin.reference.data.dataset import DataSet
