@@ -13,7 +13,7 @@ from .schema import ConfigError, Option, Section, options_of
 _ORDER = ("input", "pose", "noise", "forces", "parameters", "material", "equilibria", "training", "solver", "output")
 
 
-class SchemaType(click.ParamType):
+class SchemaType(click.ParamType[Any]):
     """A value that the schema checks: the message has the flag, what is allowed, and what came.
 
     Args:
@@ -132,9 +132,10 @@ class Command(click.Command):
             for param in self.get_params(ctx)
             if isinstance(param, click.Option) and not isinstance(param, SchemaFlag)
         ]
-        if rows := [row for param in others if (row := param.get_help_record(ctx))]:
+        records = [record for param in others if (record := param.get_help_record(ctx))]
+        if records:
             with formatter.section("Other"):
-                formatter.write_dl(rows)
+                formatter.write_dl(records)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """The arguments read; a former flag is refused with the name that it has now."""
