@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.signed import cells_inside
-from softtwin.registration.conditions import Condition, Moved, PoissonRatio, Stiffness
+from softtwin.registration.parameter_blocks import ParameterBlock, PoissonRatio, PrescribedMotion, YoungModulus
 
 Floats = NDArray[np.float64]
 WORDS = (
@@ -58,7 +58,7 @@ class NamedParameter:
             raise ParameterError(f"expected {'moved@NODES' if kind == 'moved' else kind}, got {text!r}")
         return cls(kind, found["place"] or "", _positive(found["number"], text))
 
-    def condition(self, body: Body) -> Condition:
+    def condition(self, body: Body) -> ParameterBlock:
         """What it is to a registration.
 
         Args:
@@ -66,10 +66,14 @@ class NamedParameter:
         """
         given = {} if self.number is None else {"deviation": self.number}
         if self.kind == _MODULUS:
-            return Stiffness(**given, cells=cells_inside(body, self.place) if self.place else None, name=self.place)
+            return YoungModulus(**given, cells=cells_inside(body, self.place) if self.place else None, name=self.place)
         if self.kind == "poisson-ratio":
             return PoissonRatio(**given)
-        return Moved(self.place) if self.number is None else Moved(self.place, shift=self.number)
+        return (
+            PrescribedMotion(self.place)
+            if self.number is None
+            else PrescribedMotion(self.place, translation_deviation=self.number)
+        )
 
 
 def priors_taken(parameters: tuple[str, ...]) -> list[str]:
@@ -81,7 +85,7 @@ def priors_taken(parameters: tuple[str, ...]) -> list[str]:
     silent = [
         text for text in parameters if (named := NamedParameter.parse(text)).number is None and named.kind == _MODULUS
     ]
-    taken = f"prior of ±{100 * Stiffness.deviation:.0f} % taken"
+    taken = f"prior of ±{100 * YoungModulus.deviation:.0f} % taken"
     return [f"{text}: {taken}, and forces are known no better; say {text}=DEVIATION" for text in silent]
 
 

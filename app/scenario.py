@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.export import Coordinates
 from softtwin.reference.data.loading import Loading
-from softtwin.registration.conditions import Conditions
 from softtwin.registration.contact import Patch
+from softtwin.registration.parameter_blocks import ParameterBlocks
 
 from .config import Config
 from .parameters import NamedParameter, ParameterError
@@ -104,7 +104,7 @@ class Scenario:
         found[body.fixed] = 0.0
         return found
 
-    def conditions(self, body: Body, modulus: float, ratio: float) -> Conditions | None:
+    def conditions(self, body: Body, modulus: float, ratio: float) -> ParameterBlocks | None:
         """The parameters as registration takes them; None where there are none.
 
         Args:
@@ -119,4 +119,4 @@ class Scenario:
         if not named:
             return None
         values = {"young_modulus": self.modulus(modulus, body), "poisson_ratio": ratio}
-        return Conditions(body, values, tuple(parameter.condition(body) for parameter in named))
+        return ParameterBlocks(body, values, tuple(parameter.condition(body) for parameter in named))

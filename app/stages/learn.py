@@ -15,10 +15,10 @@ from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.calibration import CalibrationWarning, calibrate, coverage
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
+from softtwin.surrogate.error_indicators import CalibrationError
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import Device, TrainingPlan
-from softtwin.surrogate.signs import CalibrationError
 from softtwin.surrogate.train import train
 from softtwin.surrogate.twin import load, save
 

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from softtwin.surrogate.course import chosen_device
 from softtwin.surrogate.physics import Physics
 from softtwin.surrogate.plan import Device, TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.registry import ARCHITECTURES
+from softtwin.surrogate.training_module import chosen_device
 
 from ..config import ConfigError, TrainingSection
 
