@@ -104,11 +104,11 @@ def generate(configuration: Path, redo: tuple[int, ...], again: bool, part: str 
     Blocks that are damaged are found and made again. Another body or configuration is refused. Once all parts of an
     array of jobs have ended, `generate` without `--part` makes what is missing, and the Jacobians.
     """
-    from softtwin.reference.data.part import Part
+    from softtwin.reference.data.shard import Shard
 
     from .stages.generate import describe_data, generate_stage
 
-    chosen = None if part is None else Part.parse(part)
+    chosen = None if part is None else Shard.parse(part)
     data = generate_stage(configuration, redo, again, chosen)
     if data is not None and chosen is not None:
         missing = len(data.missing_blocks())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import FileError
-from softtwin.registration.marks import Marks
+from softtwin.registration.landmarks import LandmarkPairs
 from softtwin.registration.pose import LandmarkFit, from_landmarks, read_landmarks
 
 from .config import ConfigError
@@ -104,7 +104,7 @@ class MarkFiles:
         """
         points = np.array(list(self.body.values()))
         try:
-            Marks.of(twin.observed, points, points)
+            LandmarkPairs.of(twin.observed, points, points)
         except ValueError as error:
             raise ConfigError(f"--marks: {error}") from None
 

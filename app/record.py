@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.metrics import target_errors
-from softtwin.registration.conditions import WITHIN_90
+from softtwin.registration.parameter_blocks import WITHIN_90
 from softtwin.registration.pose import Pose
 from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Verdict
@@ -167,11 +167,11 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "net_force_covariance_N2": (turned @ result.net_force_covariance @ turned).tolist(),
         "force_scale_N": result.force_scale,
         "largest_displacement_m": float(np.linalg.norm(result.displacement, axis=1).max()),
-        "model_doubt": result.doubt,
+        "model_doubt": result.discrepancy_scale,
         "largest_correction_m": float(np.linalg.norm(result.correction, axis=1).max()),
         "pose": twin.coordinates.motion(result.pose.matrix).tolist(),
         "points": result.points,
-        "points_alike": result.alike,
+        "points_alike": result.inflation_factor,
         "outliers": result.outliers,
         "informed": result.informed,
         "iterations": len(result.trace),
@@ -230,8 +230,8 @@ def askew_of(result: Registration) -> dict[str, Any] | None:
     if pose is None or not pose.is_said:
         return None
     return {
-        "turn_rad": result.askew.angle_to(Pose.identity()),
-        "shift_m": float(np.linalg.norm(result.askew.apply(pose.centre) - pose.centre)),
+        "turn_rad": result.pose_correction.angle_to(Pose.identity()),
+        "shift_m": float(np.linalg.norm(result.pose_correction.apply(pose.centre) - pose.centre)),
         "chance": result.chance_of_pose,
         "is_seen": result.chance_of_pose < _ASKEW,
     }

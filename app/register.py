@@ -21,7 +21,7 @@ from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import Axes, ContentError, FileError, Unit, read_cloud
 from softtwin.registration.pose import Pose, read_matrix
-from softtwin.registration.unknowns import PosePrior
+from softtwin.registration.priors import PosePrior
 
 from . import twin as twins
 from .config import ConfigError

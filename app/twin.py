@@ -23,21 +23,21 @@ from softtwin.reference.data.discrepancy import Discrepancy, read_discrepancy
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import loaded_nodes
 from softtwin.registration.cloud import Cloud, turned
-from softtwin.registration.conditions import Conditions
 from softtwin.registration.contact import ContactRegistrar
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.hybrid import HybridRegistrar
+from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.landmarks import LandmarkPairs
 from softtwin.registration.lbfgs import LBFGS
-from softtwin.registration.marks import Marks
 from softtwin.registration.options import NOISE, RegistrationOptions, expected_force, options_for
+from softtwin.registration.parameter_blocks import ParameterBlocks
 from softtwin.registration.penalties import PENALTIES
 from softtwin.registration.pose import Pose
+from softtwin.registration.priors import PosePrior
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.result import Registration
 from softtwin.registration.rigid import align
-from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Judgement, Verdict
 
 from .config import Config, ConfigError, RegistrationSection, files_axes, parse_config
@@ -46,7 +46,7 @@ from .unknowns import Scenario, UnknownError
 from .workspace import open_workspace
 
 if TYPE_CHECKING:
-    from softtwin.surrogate.certificate import Certificate, Certifier
+    from softtwin.surrogate.error_bound import ErrorBound, ErrorEstimator
     from softtwin.surrogate.loaded import LoadedSurrogate
     from softtwin.surrogate.model import Surrogate, SurrogateState
 
@@ -181,7 +181,7 @@ class Twin:
         """
         return self.model.solve(forces)
 
-    def certify(self, forces: ArrayLike, state: SurrogateState | None = None, newton: bool = False) -> Certificate:
+    def bound_error(self, forces: ArrayLike, state: SurrogateState | None = None, newton: bool = False) -> ErrorBound:
         """How wrong the network's displacement under nodal forces may be, and whether that may be relied upon.
 
         Args:
@@ -193,9 +193,9 @@ class Twin:
         Raises:
             CalibrationError: the model is no network, or it was never calibrated.
         """
-        return self._certifier.certify(forces, state, newton)
+        return self._certifier.bound_error(forces, state, newton)
 
-    def bounded(self, found: Registration) -> Certificate | None:
+    def bounded(self, found: Registration) -> ErrorBound | None:
         """How wrong the network may be about a registered state; None where there is none that was calibrated.
 
         Of the hybrid engine it is about what the network had found.
@@ -204,18 +204,18 @@ class Twin:
             found: a registration of this twin.
         """
         card: Any = getattr(self._fast or self.model, "card", {})
-        return self._certifier.certify((found.draft or found).forces) if card.get("certificate") else None
+        return self._certifier.bound_error((found.draft or found).forces) if card.get("certificate") else None
 
     @cached_property
-    def _certifier(self) -> Certifier:
-        from softtwin.surrogate.certificate import Certifier  # torch is needed here alone
+    def _certifier(self) -> ErrorEstimator:
+        from softtwin.surrogate.error_bound import ErrorEstimator  # torch is needed here alone
+        from softtwin.surrogate.error_indicators import CalibrationError
         from softtwin.surrogate.model import Surrogate
-        from softtwin.surrogate.signs import CalibrationError
 
         network = self._fast or self.model
         if not isinstance(network, Surrogate):
-            raise CalibrationError(f"Twin.certify: expected a twin with a network, got {type(network).__name__}.")
-        return Certifier(network)
+            raise CalibrationError(f"Twin.bound_error: expected a twin with a network, got {type(network).__name__}.")
+        return ErrorEstimator(network)
 
     def register(
         self,
@@ -293,7 +293,7 @@ class Twin:
         if isinstance(camera, Pose) and places.ndim == 2 and places.shape[1] == 3:
             places = camera.inverse().apply(places)
         wide = self.config.registration.landmark_deviation if deviation is None else deviation
-        return registrar.marked(Marks.of(registrar.observed, landmarks[0], places, wide))
+        return registrar.with_landmarks(LandmarkPairs.of(registrar.observed, landmarks[0], places, wide))
 
     @property
     def observed(self) -> SurfaceDistance:
@@ -442,13 +442,13 @@ class Twin:
             return ContactRegistrar(exact, patch)
         return exact if self._fast is None else HybridRegistrar(self._alone(self._fast, zone), exact)
 
-    def _conditions(self, model: ForwardModel) -> Conditions | None:
+    def _conditions(self, model: ForwardModel) -> ParameterBlocks | None:
         """Unknowns beside the forces, for the model that takes them."""
         if model is self._fast:
             return None
         material = self.config.material
         try:
-            return Scenario.of(self.config).conditions(self.body, material.young_modulus, material.poisson_ratio)
+            return Scenario.of(self.config).parameter_blocks(self.body, material.young_modulus, material.poisson_ratio)
         except ValueError as error:
             raise ConfigError(f"registration.unknowns: {error}") from None
 
@@ -458,8 +458,8 @@ class Twin:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
         loaded = loaded_nodes(body, load_plan(self.config))
         nodes = None if section.forces == "known" else body.node_sets[zone] if zone else loaded
-        conditions = self._conditions(model)
-        if nodes is not None and conditions is not None and not len(np.setdiff1d(nodes, conditions.moved)):
+        parameter_blocks = self._conditions(model)
+        if nodes is not None and parameter_blocks is not None and not len(np.setdiff1d(nodes, parameter_blocks.moved)):
             raise ConfigError(
                 f"registration.zone: expected nodes that may carry force, got {zone or 'loaded nodes'}, all of which "
                 "moved@ holds; what is moved carries none. Give another zone."
@@ -472,7 +472,7 @@ class Twin:
             smoothness=section.smoothness,
             directions=section.directions,
             options=_options(section, options_for(model, bool(zone))),
-            conditions=conditions,
+            parameter_blocks=parameter_blocks,
             modulus_deviation=self.config.material.young_modulus_deviation,
             elsewhere=loaded if zone else None,
         )
@@ -544,7 +544,7 @@ def _takes_marks(registrar: Engine) -> Registrar | HybridRegistrar:
 
 def _options(section: RegistrationSection, suited: RegistrationOptions) -> RegistrationOptions:
     spread = 0.0 if section.noise_known else NOISE.spread
-    noise = Scale(section.noise, spread, least=min(NOISE.least, section.noise))
+    noise = LogNormalPrior(section.noise, spread, minimum=min(NOISE.minimum, section.noise))
     solver = suited.solver
     if section.penalty != "prior":
         solver = LBFGS(penalty=PENALTIES[section.penalty](section.alpha))
@@ -552,15 +552,15 @@ def _options(section: RegistrationSection, suited: RegistrationOptions) -> Regis
         solver = LBFGS()
     if section.max_iterations:
         solver = replace(solver, max_iterations=section.max_iterations)
-    gathering = suited.gathering
+    localisation = suited.localisation
     if section.rounds >= 0:
-        gathering = replace(gathering, rounds=section.rounds)
+        localisation = replace(localisation, rounds=section.rounds)
     return replace(
         suited,
         noise=noise,
         solver=solver,
-        most_points=section.points,
-        gathering=gathering,
+        maximum_points=section.points,
+        localisation=localisation,
         distance=section.distance,
         normal_deviation=float(np.deg2rad(section.normal_deviation)),
     )

@@ -14,8 +14,14 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.signed import cells_inside
 from softtwin.reference.data.loading import Loading
-from softtwin.registration.conditions import Condition, Conditions, Moved, PoissonRatio, Stiffness
 from softtwin.registration.contact import Patch
+from softtwin.registration.parameter_blocks import (
+    ParameterBlock,
+    ParameterBlocks,
+    PoissonRatio,
+    PrescribedMotion,
+    YoungModulus,
+)
 
 if TYPE_CHECKING:
     from .config import Config
@@ -66,7 +72,7 @@ class Unknown:
             raise UnknownError(f"expected {'moved@NODES' if kind == 'moved' else kind}, got {text!r}")
         return cls(kind, found["place"] or "", _positive(found["number"], text))
 
-    def condition(self, body: Body) -> Condition:
+    def condition(self, body: Body) -> ParameterBlock:
         """What it is to a registration.
 
         Args:
@@ -74,10 +80,14 @@ class Unknown:
         """
         given = {} if self.number is None else {"deviation": self.number}
         if self.kind == _MODULUS:
-            return Stiffness(**given, cells=cells_inside(body, self.place) if self.place else None, name=self.place)
+            return YoungModulus(**given, cells=cells_inside(body, self.place) if self.place else None, name=self.place)
         if self.kind == "poisson-ratio":
             return PoissonRatio(**given)
-        return Moved(self.place) if self.number is None else Moved(self.place, shift=self.number)
+        return (
+            PrescribedMotion(self.place)
+            if self.number is None
+            else PrescribedMotion(self.place, translation_deviation=self.number)
+        )
 
 
 def priors_taken(unknowns: tuple[str, ...]) -> list[str]:
@@ -87,7 +97,7 @@ def priors_taken(unknowns: tuple[str, ...]) -> list[str]:
         unknowns: words, as `Unknown.parse` takes them.
     """
     silent = [text for text in unknowns if (named := Unknown.parse(text)).number is None and named.kind == _MODULUS]
-    taken = f"prior of ±{100 * Stiffness.deviation:.0f} % taken"
+    taken = f"prior of ±{100 * YoungModulus.deviation:.0f} % taken"
     return [f"{text}: {taken}, and forces are known no better; say {text}=DEVIATION" for text in silent]
 
 
@@ -185,7 +195,7 @@ class Scenario:
         found[body.fixed] = 0.0
         return found
 
-    def conditions(self, body: Body, modulus: float, ratio: float) -> Conditions | None:
+    def parameter_blocks(self, body: Body, modulus: float, ratio: float) -> ParameterBlocks | None:
         """The unknowns as registration takes them; None where there are none.
 
         Args:
@@ -200,4 +210,4 @@ class Scenario:
         if not named:
             return None
         parameters = {"young_modulus": self.modulus(modulus, body), "poisson_ratio": ratio}
-        return Conditions(body, parameters, tuple(unknown.condition(body) for unknown in named))
+        return ParameterBlocks(body, parameters, tuple(unknown.condition(body) for unknown in named))

@@ -38,8 +38,8 @@ from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import draw_load
 from softtwin.reference.solve.problem import Problem
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import expected_force, options_for
 from softtwin.registration.problem import Problem as Search
 from softtwin.registration.registrar import prepare
@@ -57,7 +57,7 @@ from softtwin.surrogate.twin import save
 Floats = NDArray[np.float64]
 NAME, BODY = "beam_registration", "beam-6.1"
 MODULUS, RATIO, POINTS = 4500.0, 0.49, 1000
-CLEAR = Scale(1e-4, 1.0, least=1e-5)  # metres: points without noise
+CLEAR = LogNormalPrior(1e-4, 1.0, minimum=1e-5)  # metres: points without noise
 KINDS = ("bending", "torsion", "both")
 FRESH = 1_000_000
 MATCHED, WRONG = (
@@ -245,7 +245,7 @@ def first_order(network: Surrogate) -> Way:
             match = observed.match(positions, given.cloud)
             full = np.zeros_like(body.points)
             full[observed.nodes] = (observed.rows(match).T @ match.distances).reshape(-1, 3) / len(given.cloud)
-            gradient = state.pull(full)[own].ravel()
+            gradient = state.vjp(full)[own].ravel()
             first[0] = first[0] or float(np.linalg.norm(gradient))
             if np.linalg.norm(gradient) <= _RELATIVE * first[0]:
                 kept[0] = coefficients.copy()

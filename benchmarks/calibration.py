@@ -39,10 +39,10 @@ from softtwin.meshes.clouds import CloudError, sample
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.solve.problem import Problem
-from softtwin.registration.evidence import Scale
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import options_for
+from softtwin.registration.priors import nodal_forces
 from softtwin.registration.registrar import prepare
-from softtwin.registration.unknowns import nodal_forces
 from softtwin.registration.verdict import Verdict
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.twin import load as load_twin
@@ -126,17 +126,17 @@ CASES: dict[str, Callable[[Path, int], Case]] = {
 
 def size_told(case: Case, body: Body) -> float:
     """Newtons for which forces of the prior move the body as far as is wanted, in the median, to first order."""
-    forces = nodal_forces(body, case.zone, Scale(1.0, SPREAD), case.smoothness)
+    forces = nodal_forces(body, case.zone, LogNormalPrior(1.0, SPREAD), case.smoothness)
     rng = np.random.default_rng(1)
     draws = forces.basis @ rng.standard_normal((forces.size, 50))
-    moved = case.network.solve(np.zeros_like(body.points)).push(draws).reshape(-1, 3, 50)
+    moved = case.network.solve(np.zeros_like(body.points)).jvp(draws).reshape(-1, 3, 50)
     return case.moved / float(np.median(np.linalg.norm(moved, axis=1).max(axis=0)))
 
 
 def run(case: Case, count: int) -> dict[str, Any]:
     """So many cases; a load without a stable equilibrium, or beyond what the network has learned, is drawn again."""
     body = case.network.body
-    scale = Scale(size_told(case, body), SPREAD, least=1e-6)
+    scale = LogNormalPrior(size_told(case, body), SPREAD, minimum=1e-6)
     drawn = nodal_forces(body, case.zone, scale, case.smoothness)
     registrar = prepare(
         case.network,
@@ -154,7 +154,7 @@ def run(case: Case, count: int) -> dict[str, Any]:
             number += 1
             size = scale.median * np.exp(SPREAD * rng.standard_normal())
             forces = drawn.forces(size * rng.standard_normal(drawn.size))
-            if (case.network.solve(forces).extent or 0.0) > 1.0:
+            if (case.network.solve(forces).extrapolation_ratio or 0.0) > 1.0:
                 again["beyond what was learned"] += 1
                 continue
             try:

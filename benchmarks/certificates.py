@@ -28,12 +28,12 @@ from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.generate import Plan, ramp_loads
 from softtwin.reference.solve.problem import Problem
 from softtwin.surrogate.calibration import calibrate, coverage, fitted_bounds, read_samples
-from softtwin.surrogate.certificate import ERRORS, Certifier, bound, range_of
 from softtwin.surrogate.domain import with_domain
+from softtwin.surrogate.error_bound import ERRORS, ErrorEstimator, bound, range_of
+from softtwin.surrogate.error_indicators import IndicatorReader
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
-from softtwin.surrogate.signs import SignReader
 from softtwin.surrogate.train import train
 from softtwin.surrogate.twin import load as load_twin
 from softtwin.surrogate.twin import save
@@ -57,7 +57,7 @@ def network_of(body: str, data: DataSet, seconds: float, ranks: int, stepped: in
     return calibrate(load_twin(folder, data.body), data, stepped=stepped)
 
 
-def set_aside(certifier: Certifier, data: DataSet, plan: Plan, problem: Problem) -> dict[str, Any]:
+def set_aside(estimator: ErrorEstimator, data: DataSet, plan: Plan, problem: Problem) -> dict[str, Any]:
     """Share of loads that is said to be outside: at the largest that were learned, and at three times these.
 
     Those of three times that are not set aside are solved: how many of them keep their bounds all the same.
@@ -65,18 +65,18 @@ def set_aside(certifier: Certifier, data: DataSet, plan: Plan, problem: Problem)
     tops = [ramp_loads(data, plan, FRESH + i)[0] for i in range(FAR)]
     found: dict[str, Any] = {}
     for scale in (1.0, 3.0):
-        given = [certifier.certify(scale * top) for top in tops]
+        given = [estimator.bound_error(scale * top) for top in tops]
         found[f"times_{scale:g}"] = float(np.mean([not each.is_inside for each in given]))
     inside = [(3.0 * top, each) for top, each in zip(tops, given, strict=True) if each.is_inside]
     kept = []
-    for load, certificate in inside:
+    for load, error_bound in inside:
         try:
             truth = problem.solve(load).displacement
         except NotConverged:
             kept.append(False)
             continue
-        missed = certifier.reader.surrogate.solve(load).displacement - truth
-        kept.append(bool(np.linalg.norm(missed, axis=1).mean() <= certificate.mean))
+        missed = estimator.reader.surrogate.solve(load).displacement - truth
+        kept.append(bool(np.linalg.norm(missed, axis=1).mean() <= error_bound.mean))
     found["times_3_inside"] = {"loads": len(kept), "kept": float(np.mean(kept)) if kept else None}
     return found
 
@@ -95,7 +95,7 @@ def resplit(surrogate: Surrogate, data: DataSet, ways: int = SPLITS) -> dict[str
     Returns:
         `kept` and `kept_in_range`, by kind of error: their `mean` and `spread` (standard deviation) over the ways.
     """
-    confidence, reader = surrogate.card["certificate"]["confidence"], SignReader(surrogate)
+    confidence, reader = surrogate.card["certificate"]["confidence"], IndicatorReader(surrogate)
     before = read_samples(reader, data, data.samples("validation"))
     held = {split: data.samples(split) for split in POOLED}
     read = [read_samples(reader, data, samples) for samples in held.values()]
@@ -132,9 +132,9 @@ def _spread(rows: list[list[float]], axis: int) -> np.ndarray:
     return np.std(rows, axis=axis, ddof=1)
 
 
-def costs(certifier: Certifier, loads: list[np.ndarray], problem: Problem) -> dict[str, float]:
+def costs(estimator: ErrorEstimator, loads: list[np.ndarray], problem: Problem) -> dict[str, float]:
     """Median wall times of a prediction and of each tier, milliseconds."""
-    surrogate = certifier.reader.surrogate
+    surrogate = estimator.reader.surrogate
     names = ("prediction", "distance", "extent", "certificate", "newton", "solve")
     taken: dict[str, list[float]] = {name: [] for name in names}
 
@@ -147,9 +147,9 @@ def costs(certifier: Certifier, loads: list[np.ndarray], problem: Problem) -> di
     for load in loads:
         state = timed("prediction", lambda load=load: surrogate.solve(load))
         timed("distance", lambda state=state: state.distance)
-        timed("extent", lambda state=state: state.extent)
-        timed("certificate", lambda load=load, state=state: certifier.certify(load, state))
-        timed("newton", lambda load=load, state=state: certifier.certify(load, state, newton=True))
+        timed("extent", lambda state=state: state.extrapolation_ratio)
+        timed("certificate", lambda load=load, state=state: estimator.bound_error(load, state))
+        timed("newton", lambda load=load, state=state: estimator.bound_error(load, state, newton=True))
         timed("solve", lambda load=load, state=state: problem.solve(load, proposal=state.displacement))
     return {name: float(np.median(values)) for name, values in taken.items()}
 
@@ -159,15 +159,15 @@ def measured(body: str, surrogate: Surrogate, data: DataSet, stepped: int) -> di
     plan = case(body).plan
     held_out = coverage(surrogate, data)
     print(held_out, flush=True)
-    certifier = Certifier(surrogate)
+    estimator = ErrorEstimator(surrogate)
     tops = [ramp_loads(data, plan, FRESH + i)[0] for i in range(TIMED)]
     with threadpool_limits(1), Problem(data.body, plan.build_material()) as problem:
         return {
             "calibrated": surrogate.card["certificate"],
             "held_out": held_out.as_dict(),
-            "outside": set_aside(certifier, data, plan, problem),
+            "outside": set_aside(estimator, data, plan, problem),
             "held_out_newton": coverage(surrogate, data, limit=stepped, newton=True).as_dict(),
-            "ms": costs(certifier, tops, problem),
+            "ms": costs(estimator, tops, problem),
         }
 
 

@@ -92,7 +92,7 @@ def judged(result: Registration, rest: Floats, truth: Floats) -> dict[str, Any]:
         "verdict": result.judgement.verdict.value,
         "tre_mm": 1e3 * float(errors.mean()),
         "held": float((errors <= result.uncertainty.margin()).mean()),
-        "model_doubt": result.doubt,
+        "model_doubt": result.discrepancy_scale,
         "outliers": result.outliers,
         "by_error": len(reasons) == 1 and "seen to get wrong" in reasons[0],
     }

@@ -159,7 +159,7 @@ def stepped_way(problem: Problem) -> Way:
 def without_training(network: Surrogate) -> Surrogate:
     """The same network with random weights of the same sizes."""
     generator = torch.Generator().manual_seed(0)
-    other = Surrogate(network.body, network.maps, copy.deepcopy(network.network), network.card)
+    other = Surrogate(network.body, network.encoder_decoder, copy.deepcopy(network.network), network.card)
     for weights in other.network.parameters():
         noise = torch.randn(weights.shape, generator=generator, dtype=weights.dtype)
         weights.data = weights.std(correction=0) * noise

@@ -31,8 +31,8 @@ from softtwin.reference.data.loading import Loading
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.solve.problem import NewtonOptions, Problem
-from softtwin.registration.conditions import WITHIN_90, Conditions, Estimate, PoissonRatio, Stiffness
 from softtwin.registration.options import expected_force, options_for
+from softtwin.registration.parameter_blocks import WITHIN_90, Estimate, ParameterBlocks, PoissonRatio, YoungModulus
 from softtwin.registration.registrar import prepare
 from softtwin.registration.result import Registration
 
@@ -76,15 +76,15 @@ def drawn(
 
 
 def registered(
-    body: Body, cloud: Floats, zone: Ints | None, conditions: Conditions, known: Floats | None = None
+    body: Body, cloud: Floats, zone: Ints | None, parameter_blocks: ParameterBlocks, known: Floats | None = None
 ) -> Registration:
     """The cloud, with forces in a zone, or with all of them known."""
-    with Problem(body, NeoHookean(**conditions.parameters), SEARCH) as problem:
+    with Problem(body, NeoHookean(**parameter_blocks.parameters), SEARCH) as problem:
         model = ReferenceModel(problem, patient=False, loading=Loading(forces=known))
         scale = expected_force(body, MODULUS)
         registrar = prepare(
             model, zone, body.surfaces["observed"], force_scale=scale, options=options_for(model, zone is not None),
-            conditions=conditions,
+            parameter_blocks=parameter_blocks,
         )  # fmt: skip
         return told(registrar.register(cloud))
 
@@ -115,12 +115,12 @@ def of_unknowns(estimates: Sequence[Estimate], true: dict[str, float]) -> dict[s
 def force_over_modulus(body: Body, seed: int) -> dict[str, Any]:
     """Forces, E and nu unknown: force / E against the truth's."""
     rng = np.random.default_rng([seed, 0])
-    prior = Stiffness(KNOWN), PoissonRatio(0.5)
-    conditions = Conditions(body, {"young_modulus": MODULUS, "poisson_ratio": RATIO}, prior)
-    material = conditions.inputs(rng.standard_normal(2)).parameters
+    prior = YoungModulus(KNOWN), PoissonRatio(0.5)
+    parameter_blocks = ParameterBlocks(body, {"young_modulus": MODULUS, "poisson_ratio": RATIO}, prior)
+    material = parameter_blocks.inputs(rng.standard_normal(2)).parameters
     modulus, ratio = float(np.mean(material["young_modulus"])), float(np.mean(material["poisson_ratio"]))
     forces, zone, truth, cloud = drawn(body, modulus, ratio, seed)
-    found = registered(body, cloud, zone, conditions)
+    found = registered(body, cloud, zone, parameter_blocks)
     row = figures(found, truth, {"Young's modulus": modulus, "Poisson's ratio": ratio})
     assert found.force_over_modulus is not None
     for name, value, doubt, true in (
@@ -140,11 +140,11 @@ def inclusion(body: Body, seed: int, is_known: bool, clouds: int = 1) -> dict[st
     moduli = np.full(len(body.cells), rest)
     moduli[region] *= times
     parameters = {"young_modulus": np.full(len(body.cells), MODULUS), "poisson_ratio": RATIO}
-    conditions = Conditions(body, parameters, (Stiffness(KNOWN), Stiffness(1.0, region, "tumour")))
+    parameter_blocks = ParameterBlocks(body, parameters, (YoungModulus(KNOWN), YoungModulus(1.0, region, "tumour")))
     true, rows, found = {"Young's modulus": rest, "Young's modulus of tumour": rest * times}, [], []
     for number in range(clouds):
         forces, zone, truth, cloud = drawn(body, moduli, RATIO, FURTHER * number + seed, "tumour")
-        result = registered(body, cloud, None if is_known else zone, conditions, forces if is_known else None)
+        result = registered(body, cloud, None if is_known else zone, parameter_blocks, forces if is_known else None)
         found.append(result)
         rows.append(figures(result, truth, true))
     worst = max(rows, key=lambda row: ("accepted", "doubtful", "refused").index(row["verdict"]))

@@ -33,7 +33,6 @@ from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import Embedding, embed
-from softtwin.reference.alternatives import Alternatives, differences
 from softtwin.reference.data.dataset import existing
 from softtwin.reference.data.discrepancy import Discrepancy, discrepancy_of, read_discrepancy, write_discrepancy
 from softtwin.reference.data.materials import LinearElastic, Material, NeoHookean
@@ -42,10 +41,11 @@ from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.fem.fenicsx import MPI
 from softtwin.reference.generate import Plan, generate
+from softtwin.reference.model_error import ModelErrorEnsemble, differences
 from softtwin.reference.solve.problem import NewtonOptions, Problem
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.hybrid import HybridRegistrar
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import NOISE, expected_force, options_for
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.result import Registration
@@ -57,7 +57,7 @@ Floats = NDArray[np.float64]
 NAME = "liver_engines"
 SHARES = (0.5, 0.9, 0.95)
 LOOSE = NewtonOptions(tolerance=1e-5, max_iterations=15)
-DOUBT = Alternatives(attachment=0.004, poisson_ratio=(0.42, 0.49), meshes=3)
+DOUBT = ModelErrorEnsemble(attachment=0.004, poisson_ratio=(0.42, 0.49), meshes=3)
 DRAWS, LOADS, MODULUS_OFF = 96, 48, 0.3
 
 
@@ -153,7 +153,7 @@ def registrars(row: Row, twin: Path, ranks: int) -> Iterator[dict[str, Registrar
         def alone(model: ForwardModel, zone: NDArray[np.int64]) -> Registrar:
             options = options_for(model, has_zone=True)
             if row.noise is not None:
-                options = replace(options, noise=Scale(row.noise, NOISE.spread, least=row.noise))
+                options = replace(options, noise=LogNormalPrior(row.noise, NOISE.spread, minimum=row.noise))
             return prepare(
                 model,
                 zone,

@@ -35,8 +35,8 @@ from softtwin.reference.data.dataset import DataSet, Samples, existing
 from softtwin.reference.data.jacobians import missing_jacobians
 from softtwin.surrogate.architecture import Architecture, Network
 from softtwin.surrogate.balance import balance
+from softtwin.surrogate.encoder_decoder import LinearEncoderDecoder
 from softtwin.surrogate.evaluate import evaluate, jacobian_errors, spread
-from softtwin.surrogate.maps import LinearMaps
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.physics import Physics
@@ -200,7 +200,7 @@ def linear_map(data: DataSet, count: int | None = None) -> Surrogate:
         found.append((float(np.linalg.norm(loads @ tried.T @ modes.T - truth)), tried))
     to_coordinates = min(found, key=lambda pair: pair[0])[1]
     size, inputs = len(modes), forces.shape[1]
-    maps = LinearMaps(
+    maps = LinearEncoderDecoder(
         data.response.loaded, np.zeros(size), modes, to_coordinates, np.zeros((1, inputs)), np.zeros((size, 1))
     )
     return Surrogate(data.body, maps, _Nothing(), {"architecture": "linear map"})

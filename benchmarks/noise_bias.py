@@ -34,7 +34,7 @@ def measure(name: str, draws: int) -> list[dict[str, float]]:
         registrar = registrar_for(model, data.zone, True)
         observed, net = registrar.observed, registrar.forces.net_basis
         for frame in range(0, 10, 2):
-            state = registrar.register(data.clouds[frame]).trial.state
+            state = registrar.register(data.clouds[frame]).evaluation.state
             truth = (data.positions[frame] - model.body.points)[observed.nodes]
             along = data.net_forces[frame] / np.linalg.norm(data.net_forces[frame])
             for mm, taken in rows:

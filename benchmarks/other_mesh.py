@@ -69,7 +69,7 @@ class OtherMesh:
         value, steps = self._objective(state.displacement, wanted, forces), 0
         while steps < _STEPS and limit > _LEAST:
             steps += 1
-            slopes = self.rows @ state.push(basis)
+            slopes = self.rows @ state.jvp(basis)
             missed = (self.carrier.displace(state.displacement) - wanted).ravel()
             values, vectors = np.linalg.eigh(slopes.T @ slopes + np.eye(len(forces)) * (_TOLD / _FREE) ** 2)
             pulled = vectors.T @ (slopes.T @ missed + forces * (_TOLD / _FREE) ** 2)

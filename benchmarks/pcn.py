@@ -33,7 +33,7 @@ from softtwin.app.twin import Twin
 from softtwin.meshes.clouds import partial_view
 from softtwin.reference.data.dataset import DataSet
 from softtwin.registration.loss import Loss, Tukey
-from softtwin.registration.problem import Problem, Trial
+from softtwin.registration.problem import Evaluation, Problem
 from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
@@ -49,20 +49,20 @@ class Law:
 
     Args:
         problem: what was registered.
-        trial: where the solver ended.
+        evaluation: where the solver ended.
         scale: standard deviation of each coefficient beforehand, (k,).
         noise: found, metres.
         deviations: of the points, (p,), metres.
-        alike: so many points tell what one would.
+        inflation_factor: so many points tell what one would.
         loss: of each.
     """
 
     problem: Problem
-    trial: Trial
+    evaluation: Evaluation
     scale: Floats
     noise: float
     deviations: Floats
-    alike: float
+    inflation_factor: float
     loss: Loss
 
     @classmethod
@@ -71,27 +71,27 @@ class Law:
         problem, scales = found.problem, found.posterior.scales
         scale = np.ones(problem.size)
         scale[problem.force_part] = scales.force
-        deviations = np.hypot(scales.noise, problem.left_out(found.trial))
-        return cls(problem, found.trial, scale, scales.noise, deviations, found.alike, loss or Tukey())
+        deviations = np.hypot(scales.noise, problem.left_out(found.evaluation))
+        return cls(problem, found.evaluation, scale, scales.noise, deviations, found.inflation_factor, loss or Tukey())
 
     def log_likelihood(self, whitened: Floats) -> float:
         """Of coefficients over their scales beforehand, (k,), up to a constant."""
         scaled = self.problem.residuals(self._trial(whitened), self.noise) / self.deviations
-        return -float(self.loss.value(scaled).sum()) / self.alike
+        return -float(self.loss.value(scaled).sum()) / self.inflation_factor
 
-    def _trial(self, whitened: Floats) -> Trial:
-        return self.problem.trial(self.scale * whitened, self.trial)
+    def _trial(self, whitened: Floats) -> Evaluation:
+        return self.problem.evaluation(self.scale * whitened, self.evaluation)
 
     @property
     def mode(self) -> Floats:
         """Where the solver ended, whitened, (k,)."""
-        return self.trial.coefficients / self.scale
+        return self.evaluation.coefficients / self.scale
 
     def covariance(self) -> Floats:
         """Laplace's, whitened, (k, k), with the weights that the product's has."""
-        scaled = self.problem.residuals(self.trial, self.noise) / self.deviations
-        trusted = np.sqrt(self.loss.weight(scaled) / self.alike) / self.deviations
-        slopes = trusted[:, None] * self.problem.jacobian(self.trial) * self.scale
+        scaled = self.problem.residuals(self.evaluation, self.noise) / self.deviations
+        trusted = np.sqrt(self.loss.weight(scaled) / self.inflation_factor) / self.deviations
+        slopes = trusted[:, None] * self.problem.jacobian(self.evaluation) * self.scale
         return np.linalg.inv(slopes.T @ slopes + np.eye(len(self.scale)))
 
     def quantities(self, whitened: Floats) -> Floats:
@@ -105,12 +105,12 @@ class Law:
 
     def slopes(self) -> Floats:
         """Their derivative by the whitened coefficients at the mode, (6, k)."""
-        pushed = self.trial.state.full.push(self.problem.forces.basis)
+        pushed = self.evaluation.state.full.jvp(self.problem.forces.basis)
         blocks = [pushed.reshape(-1, 3, pushed.shape[1]).mean(axis=0)]
         if self.problem.error is not None:
             modes = self.problem.error.size * self.problem.error.discrepancy.modes
             blocks.append(modes.reshape(-1, 3, modes.shape[1]).mean(axis=0))
-        return np.vstack([self.problem.net_forces(self.trial), np.hstack(blocks)]) * self.scale
+        return np.vstack([self.problem.net_forces(self.evaluation), np.hstack(blocks)]) * self.scale
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from threadpoolctl import threadpool_limits
 
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.pose import Pose
-from softtwin.registration.unknowns import PosePrior
+from softtwin.registration.priors import PosePrior
 
 Floats = NDArray[np.float64]
 NAME = "pose_noise"

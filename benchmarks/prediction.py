@@ -46,8 +46,8 @@ def surrogate_of(architecture: Architecture, data: DataSet) -> Surrogate:
     """One with fresh weights."""
     torch.manual_seed(0)
     samples = data.samples("train")
-    lesson = architecture.lesson(data, samples, data.samples("validation"))
-    return Surrogate(data.body, lesson.maps(), lesson.trained(), {"architecture": architecture.name})
+    objective = architecture.objective(data, samples, data.samples("validation"))
+    return Surrogate(data.body, objective.encoder_decoder(), objective.trained(), {"architecture": architecture.name})
 
 
 def median_ms(task: Callable[[], Any]) -> float:
@@ -94,7 +94,7 @@ def counted(surrogate: Surrogate) -> tuple[float, float]:
 
     from softtwin.surrogate.export import Value
 
-    inputs = 3 * len(surrogate.maps.loaded)
+    inputs = 3 * len(surrogate.encoder_decoder.loaded)
     module = Value(surrogate, np.eye(inputs))
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         module(torch.zeros(1, inputs))
@@ -110,10 +110,13 @@ def apart(surrogate: Surrogate, load: NDArray[np.float64], displacement: NDArray
 
 def pushed(surrogate: Surrogate, count: int = 64) -> dict[str, float]:
     """Tangents of the network alone in single precision: by its own derivatives, and by torch.func."""
-    network, width = surrogate.single, len(surrogate.maps.encoded(np.zeros(3 * len(surrogate.maps.loaded))))
+    network, width = (
+        surrogate.single,
+        len(surrogate.encoder_decoder.encoded(np.zeros(3 * len(surrogate.encoder_decoder.loaded)))),
+    )
     at, tangents = torch.ones(width), torch.ones(width, count)
     ways = {"own": network.linearised(at), "torch.func": Differentiated(network, at)}
-    return {name: median_ms(lambda way=way: way.push(tangents)) for name, way in ways.items()}
+    return {name: median_ms(lambda way=way: way.jvp(tangents)) for name, way in ways.items()}
 
 
 def measured(

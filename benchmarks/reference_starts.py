@@ -64,11 +64,11 @@ def steps(model: ReferenceModel, name: str) -> list[dict[str, Any]]:
     ):
         rows.append(timed(label, lambda wanted=wanted, near=near: model.solve(wanted, near=near))[0])
     rng = np.random.default_rng(0)
-    pulled.pull(pulled.displacement)  # factors
+    pulled.vjp(pulled.displacement)  # factors
     for count in COLUMNS:
         columns = rng.standard_normal((body.points.size, count))
         start = time.process_time()
-        pulled.push(columns)
+        pulled.jvp(columns)
         rows.append({"step": f"push, {count} columns", "cpu_seconds_a_column": (time.process_time() - start) / count})
         print(rows[-1], flush=True)
     return rows

@@ -30,9 +30,9 @@ from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.options import expected_force, options_for
 from softtwin.registration.pose import Pose
+from softtwin.registration.priors import PosePrior
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.result import Registration
-from softtwin.registration.unknowns import PosePrior
 
 Floats = NDArray[np.float64]
 Generator = np.random.Generator

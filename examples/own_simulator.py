@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.surrogate.evaluate import evaluate
-from softtwin.surrogate.own_data import data_set_from_arrays
+from softtwin.surrogate.from_arrays import data_set_from_arrays
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train

@@ -45,13 +45,13 @@ class Value(nn.Module):
 
     def __init__(self, surrogate: Surrogate, basis: Floats, kind: torch.dtype = torch.float32) -> None:
         super().__init__()
-        maps = surrogate.maps
+        encoder_decoder = surrogate.encoder_decoder
         self.network = copy.deepcopy(surrogate.network).to(kind).requires_grad_(False)
         for name, values in (
-            ("offset", maps.offset),
-            ("linear", maps.linear(basis)),
-            ("encode", maps.encoded(basis)),
-            ("decode", maps.decode),
+            ("offset", encoder_decoder.offset),
+            ("linear", encoder_decoder.linear(basis)),
+            ("encode", encoder_decoder.encoded(basis)),
+            ("decode", encoder_decoder.decode),
         ):
             self.register_buffer(name, None if values is None else torch.tensor(values, dtype=kind))
 
@@ -70,7 +70,7 @@ class Linearised(Value):
     def forward(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         """Displacement and Jacobian."""
         at = self.network.linearised(self.encode @ coefficients)
-        slopes = self.linear + self._decoded(at.push(self.encode))
+        slopes = self.linear + self._decoded(at.jvp(self.encode))
         return self.offset + self.linear @ coefficients + self._decoded(at.values[:, None])[:, 0], slopes
 
 
@@ -88,7 +88,7 @@ def leading_directions(surrogate: Surrogate, count: int) -> Floats:
         raise ValueError(f"leading_directions.count: expected at least 1, got {count}.")
     every = np.zeros((surrogate.body.points.size, len(surrogate.rows)))
     every[surrogate.rows, np.arange(len(surrogate.rows))] = 1.0
-    whole = surrogate.solve(np.zeros_like(surrogate.body.points)).push(every)
+    whole = surrogate.solve(np.zeros_like(surrogate.body.points)).jvp(every)
     return np.ascontiguousarray(np.linalg.svd(whole, full_matrices=False)[2][:count].T)
 
 
@@ -132,7 +132,7 @@ def export(surrogate: Surrogate, folder: Path | str, directions: int = 64) -> Pa
         raise ValueError(f"export.folder: expected none, or one that was exported before, got {folder}.")
     _need_onnx()
     basis = leading_directions(surrogate, directions)
-    inputs = 3 * len(surrogate.maps.loaded)
+    inputs = 3 * len(surrogate.encoder_decoder.loaded)
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -147,7 +147,7 @@ def export(surrogate: Surrogate, folder: Path | str, directions: int = 64) -> Pa
         linearised = torch.export.export(graph, (coefficients,))
         _write(linearised, partial / "linearised", ["coefficients"], ["displacement", "jacobian"])
     np.save(partial / "directions.npy", basis)
-    np.save(partial / "loaded.npy", surrogate.maps.loaded)
+    np.save(partial / "loaded.npy", surrogate.encoder_decoder.loaded)
     manifest = {
         "format": FORMAT,
         "body": surrogate.body.fingerprint,

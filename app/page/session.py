@@ -226,7 +226,7 @@ class Session:
             self.hand.let_go(event.client_id)
 
     def _show_prediction(self, found: Prediction) -> None:
-        certificate, (verdict, reason) = found.certificate, judged(found)
+        error_bound, (verdict, reason) = found.error_bound, judged(found)
         self.picture.show_cloud(None)
         self.controls.describe("movement")
         self.picture.paint(np.linalg.norm(found.displacement, axis=1), SCALES["movement"])
@@ -236,8 +236,8 @@ class Session:
                 "forward prediction of a pull, with its certificate",
                 verdict,
                 reason,
-                bound=np.nan if certificate is None else certificate.largest,
-                confidence=np.nan if certificate is None else certificate.confidence,
+                bound=np.nan if error_bound is None else error_bound.largest,
+                confidence=np.nan if error_bound is None else error_bound.confidence,
                 net_force=float(np.linalg.norm(found.pull)),
                 frame_time=time.monotonic() - found.asked,
                 dropped=self._dropped,

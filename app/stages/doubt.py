@@ -38,8 +38,8 @@ def doubt_stage(configuration: Path) -> str | None:
         DataSetError: the training samples are not complete, or of another body or configuration.
         FailedElsewhere: on the other ranks, where rank 0 raises one of these.
     """
-    from softtwin.reference.alternatives import differences, forget  # FEniCSx is needed by this stage alone
     from softtwin.reference.fem.fenicsx import MPI
+    from softtwin.reference.model_error import differences, forget  # FEniCSx is needed by this stage alone
 
     comm, begin = MPI.COMM_WORLD, time.perf_counter()
     asked = on_first(comm, lambda: _read(configuration))
@@ -73,11 +73,11 @@ def alternatives_of(config: Config) -> Any:
     Raises:
         ConfigError: nothing, or what cannot be.
     """
-    from softtwin.reference.alternatives import Alternatives
+    from softtwin.reference.model_error import ModelErrorEnsemble
 
     section = config.doubt
     try:
-        return Alternatives(section.attachment, section.poisson_ratio or None, section.meshes)
+        return ModelErrorEnsemble(section.attachment, section.poisson_ratio or None, section.meshes)
     except ValueError as error:
         raise ConfigError(f"doubt: {error}") from None
 

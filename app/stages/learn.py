@@ -15,17 +15,17 @@ import numpy as np
 from softtwin.meshes.metrics import nodal_distances
 from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.calibration import CalibrationWarning, calibrate, coverage
-from softtwin.surrogate.course import chosen_device
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
+from softtwin.surrogate.error_indicators import CalibrationError
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.physics import Physics
 from softtwin.surrogate.plan import Device, TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.registry import ARCHITECTURES
-from softtwin.surrogate.signs import CalibrationError
 from softtwin.surrogate.train import train
+from softtwin.surrogate.training_module import chosen_device
 from softtwin.surrogate.twin import load, save
 
 from ..config import ConfigError, TrainingSection, to_toml

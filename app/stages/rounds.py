@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softtwin.reference.data.dataset import DataSet, write_chosen
 from softtwin.reference.generate import candidate_loads, plan_from_header, solve_block
-from softtwin.surrogate.acquisition import most_telling
+from softtwin.surrogate.acquisition import most_informative
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.train import train
 from softtwin.surrogate.twin import CARD, load, save
@@ -58,7 +58,7 @@ def choose(space: Workspace, data: DataSet, number: int) -> None:
         return np.asarray(factors[:, None, None] * loads)
 
     known = data.samples("train", before).forces
-    places = most_telling(surrogate, map(forces, pool), each, known)
+    places = most_informative(surrogate, map(forces, pool), each, known)
     save(surrogate, _network(space.data, number))
     write_chosen(space.data, number * each, pool.start + places)
 

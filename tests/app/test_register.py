@@ -26,7 +26,7 @@ from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import FileError, read_body, write_body
 from softtwin.registration.pose import Pose
-from softtwin.registration.unknowns import PosePrior
+from softtwin.registration.priors import PosePrior
 
 from .conftest import pulled, run, seen_cloud
 
@@ -167,7 +167,7 @@ def test_a_start_is_an_unknown_unless_said_otherwise(plain_twin: Twin, wanted: s
     twin = Twin(plain_twin.model, Config.model_validate({"registration": {"pose": wanted, "pose_turn": 2.0}}))
     camera = camera_of(twin, Pose.identity() if given else None)
     assert type(camera) is kind
-    assert not isinstance(camera, PosePrior) or camera.turn == pytest.approx(np.deg2rad(2.0))
+    assert not isinstance(camera, PosePrior) or camera.rotation_deviation == pytest.approx(np.deg2rad(2.0))
 
 
 # --- What is written.

@@ -34,7 +34,7 @@ from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.jacobians import stored_modes
 from softtwin.surrogate.calibration import CalibrationWarning
-from softtwin.surrogate.signs import CalibrationError
+from softtwin.surrogate.error_indicators import CalibrationError
 
 ENTRIES = {
     "folder": ".",
@@ -456,15 +456,15 @@ def test_a_twin_says_how_wrong_it_may_be(capsys, tmp_path: Path) -> None:
     assert "calibration  12 accepted" in run(capsys, "data", "show", folder / "organ.toml")
     with Twin.open(folder / "twin") as twin:
         load = np.zeros_like(twin.body.points)
-        load[twin.model.maps.loaded, 2] = 1e-3
-        found = twin.certify(load, twin.predict(load))
+        load[twin.model.encoder_decoder.loaded, 2] = 1e-3
+        found = twin.bound_error(load, twin.predict(load))
         assert 0.0 < found.mean <= found.largest < np.inf
-        assert not twin.certify(1e3 * load).is_inside
+        assert not twin.bound_error(1e3 * load).is_inside
     with (
         Twin.open(folder / "twin", "reference") as twin,
         pytest.raises(CalibrationError, match="a twin with a network"),
     ):
-        twin.certify(load)
+        twin.bound_error(load)
 
 
 def test_too_few_draws_for_a_bound_leave_a_twin_without_one(tmp_path: Path) -> None:
@@ -480,4 +480,4 @@ def test_too_few_draws_for_a_bound_leave_a_twin_without_one(tmp_path: Path) -> N
         Twin.open(folder / "twin") as twin,
         pytest.raises(CalibrationError, match="expected a twin that was calibrated"),
     ):
-        twin.certify(np.zeros_like(twin.body.points))
+        twin.bound_error(np.zeros_like(twin.body.points))

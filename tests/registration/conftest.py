@@ -32,12 +32,12 @@ class CantileverState:
     def _slope(self) -> np.ndarray:
         return self.reach * (1.0 - np.tanh(self.mean) ** 2)
 
-    def push(self, changes: ArrayLike) -> np.ndarray:
+    def jvp(self, changes: ArrayLike) -> np.ndarray:
         moved = np.asarray(changes).reshape(len(self.shape), 3, -1)
         mean = np.einsum("n,nik->ik", self.shape, moved)
         return np.einsum("n,i,ik->nik", self.shape, self._slope, mean).reshape(-1, moved.shape[2])
 
-    def pull(self, cotangent: ArrayLike) -> np.ndarray:
+    def vjp(self, cotangent: ArrayLike) -> np.ndarray:
         return self.shape[:, None] * self._slope * (self.shape @ np.asarray(cotangent))
 
 

@@ -15,10 +15,9 @@ import pytest
 import torch
 
 from softtwin.reference.data.dataset import DataSet, DataSetError, drop_block
-from softtwin.surrogate import course as training
+from softtwin.surrogate import training_module as training
 from softtwin.surrogate.architecture import Architecture
 from softtwin.surrogate.checkpoint import CHECKPOINT, VERSION, CheckpointError
-from softtwin.surrogate.course import Course, Diverged, chosen_device, fit, rate_factor
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
@@ -28,6 +27,7 @@ from softtwin.surrogate.precision import without_tf32
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.registry import ARCHITECTURES
 from softtwin.surrogate.train import train
+from softtwin.surrogate.training_module import Diverged, TrainingModule, chosen_device, fit, rate_factor
 from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
 
@@ -60,7 +60,7 @@ class Ticking:
 def _weights(surrogate: Surrogate) -> dict[str, np.ndarray]:
     return {
         name: np.asarray(tensor)
-        for name, tensor in [*surrogate.network.state_dict().items(), *surrogate.maps.arrays().items()]
+        for name, tensor in [*surrogate.network.state_dict().items(), *surrogate.encoder_decoder.arrays().items()]
     }
 
 
@@ -70,14 +70,14 @@ def _same(a: Surrogate, b: Surrogate) -> bool:
 
 
 def _stop_in_round(monkeypatch: pytest.MonkeyPatch, number: int, act: Any) -> None:
-    original = Course.on_train_epoch_start
+    original = TrainingModule.on_train_epoch_start
 
-    def stopping(self: Course) -> None:
+    def stopping(self: TrainingModule) -> None:
         original(self)
         if self.current_epoch == number:
             act()
 
-    monkeypatch.setattr(Course, "on_train_epoch_start", stopping)
+    monkeypatch.setattr(TrainingModule, "on_train_epoch_start", stopping)
 
 
 @pytest.mark.parametrize(
@@ -89,11 +89,11 @@ def test_four_samples_are_learnt_by_heart(data: DataSet, tmp_path: Path, archite
     plan = TrainingPlan(architecture, samples=4, epochs=240)
     four = data.samples("train", 4)
     torch.manual_seed(0)
-    lesson = architecture.lesson(data, four, four)
-    course = Course(lesson, plan, "")
-    start = lesson.error()
-    fit(course, tmp_path / CHECKPOINT, False)
-    assert course.best_error < 0.02 * start
+    objective = architecture.objective(data, four, four)
+    training_module = TrainingModule(objective, plan, "")
+    start = objective.error()
+    fit(training_module, tmp_path / CHECKPOINT, False)
+    assert training_module.best_error < 0.02 * start
 
 
 def test_the_reduced_network_beats_the_linear_response_on_unseen_samples(reduced: Surrogate, data: DataSet) -> None:
@@ -186,13 +186,13 @@ def test_mixed_precision_learns_too(data: DataSet) -> None:
 def test_single_precision_is_without_tf32(
     data: DataSet, short: TrainingPlan, monkeypatch: pytest.MonkeyPatch, precision: Any, allowed: bool
 ) -> None:
-    seen, step = set(), Course.training_step
+    seen, step = set(), TrainingModule.training_step
 
-    def looking(course: Course, batch: Any, number: int) -> Any:
+    def looking(training_module: TrainingModule, batch: Any, number: int) -> Any:
         seen.add((torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32))
-        return step(course, batch, number)
+        return step(training_module, batch, number)
 
-    monkeypatch.setattr(Course, "training_step", looking)
+    monkeypatch.setattr(TrainingModule, "training_step", looking)
     with without_tf32(False):  # it brings back what was
         torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
         train(data, replace(short, precision=precision))
@@ -204,13 +204,13 @@ def test_single_precision_is_without_tf32(
 def test_bfloat16_on_a_processor_is_without_onednn(
     data: DataSet, short: TrainingPlan, monkeypatch: pytest.MonkeyPatch, precision: Any, allowed: bool
 ) -> None:
-    seen, step = set(), Course.training_step
+    seen, step = set(), TrainingModule.training_step
 
-    def looking(course: Course, batch: Any, number: int) -> Any:
+    def looking(training_module: TrainingModule, batch: Any, number: int) -> Any:
         seen.add(torch.backends.mkldnn.enabled)
-        return step(course, batch, number)
+        return step(training_module, batch, number)
 
-    monkeypatch.setattr(Course, "training_step", looking)
+    monkeypatch.setattr(TrainingModule, "training_step", looking)
     assert torch.backends.mkldnn.enabled
     train(data, replace(short, precision=precision, device="cpu"))
     assert seen == {allowed}

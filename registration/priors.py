@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import outer_nodes
 
-from .evidence import Scale
 from .forward import Discrepancy, ReducedModel
+from .hyperparameters import LogNormalPrior
 from .pose import Pose
 from .residuals import SurfaceDistance
 
@@ -22,11 +22,11 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _SMALLEST_VARIANCE = 1e-5  # of a pattern of forces, relative to the largest: rougher ones are left out
 _TANGENTIAL = 0.5  # weight of movements along the observed side: they become normal where it turns
-FORCE = Scale(0.01, 2.0, least=1e-5)
+FORCE = LogNormalPrior(0.01, 2.0, minimum=1e-5)
 
 
 @dataclass(frozen=True, eq=False)
-class Forces:
+class NodalForces:
     """Nodal forces as a linear function of coefficients, independent and of one scale beforehand.
 
     Args:
@@ -42,7 +42,7 @@ class Forces:
     nodes: Ints
     patterns: Floats
     count: int
-    scale: Scale = FORCE
+    scale: LogNormalPrior = FORCE
     left_out: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     every: Floats | None = None
     kept: Floats | None = None
@@ -81,7 +81,7 @@ class Forces:
         found: Floats = np.linalg.lstsq(self.patterns, nodal[self.nodes].ravel(), rcond=None)[0]
         return found
 
-    def combined(self, kept: Floats) -> Forces:
+    def combined(self, kept: Floats) -> NodalForces:
         """The forces in orthonormal combinations of their directions; the net force of the others is left in doubt.
 
         Args:
@@ -93,7 +93,7 @@ class Forces:
         both = kept if self.kept is None else self.kept @ kept
         return replace(self, patterns=self.patterns @ kept, left_out=left, every=every, kept=both)
 
-    def leading(self, count: int) -> Forces:
+    def leading(self, count: int) -> NodalForces:
         """The first directions alone: those that move the observed side most, where they were reduced."""
         kept = None if self.kept is None else self.kept[:, :count]
         return replace(self, patterns=self.patterns[:, :count], kept=kept)
@@ -109,7 +109,7 @@ def _net(patterns: Floats) -> Floats:
     return summed
 
 
-def nodal_forces(body: Body, nodes: ArrayLike, scale: Scale = FORCE, smoothness: float = 0.0) -> Forces:
+def nodal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, smoothness: float = 0.0) -> NodalForces:
     """Three force components at every node of a zone.
 
     With a smoothness length s, the forces of two nodes at distance d correlate by exp(-d^2 / 2 s^2), so that a smooth
@@ -133,17 +133,17 @@ def nodal_forces(body: Body, nodes: ArrayLike, scale: Scale = FORCE, smoothness:
             "give the zone that the tool may touch."
         )
     root = _correlation_root(body.points[chosen], smoothness)
-    return Forces(chosen, np.kron(root, np.eye(3)), len(body.points), scale)
+    return NodalForces(chosen, np.kron(root, np.eye(3)), len(body.points), scale)
 
 
-def known_forces(body: Body, scale: Scale = FORCE) -> Forces:
+def known_forces(body: Body, scale: LogNormalPrior = FORCE) -> NodalForces:
     """No unknown force: all that acts is the model's own loading.
 
     Args:
         body: the body.
         scale: without effect.
     """
-    return Forces(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), len(body.points), scale)
+    return NodalForces(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), len(body.points), scale)
 
 
 def _correlation_root(positions: Floats, smoothness: float) -> Floats:
@@ -158,7 +158,7 @@ def _correlation_root(positions: Floats, smoothness: float) -> Floats:
 
 
 @dataclass(frozen=True)
-class Informed:
+class LikelihoodInformed:
     """Which directions of force a cloud can tell: those that move the observed side by more than the noise.
 
     Args:
@@ -166,17 +166,17 @@ class Informed:
         points: number of points of a cloud expected.
         scale: largest scale of the coefficients expected, newtons.
         information: directions whose expected information, in units of the prior's, is below this are left out.
-        most: most directions kept.
+        maximum: most directions kept.
     """
 
     noise: float = 1e-4
     points: int = 500
     scale: float = 0.03
     information: float = 0.5
-    most: int = 96
+    maximum: int = 96
 
 
-def told(model: ReducedModel, observed: SurfaceDistance, rule: Informed) -> Floats:
+def told(model: ReducedModel, observed: SurfaceDistance, rule: LikelihoodInformed) -> Floats:
     """Orthonormal combinations of a force basis that a cloud can tell at rest, (k, kept), those told best first.
 
     They are the leading eigenvectors of the prior-whitened Gauss-Newton matrix at rest: the likelihood-informed
@@ -190,11 +190,11 @@ def told(model: ReducedModel, observed: SurfaceDistance, rule: Informed) -> Floa
     moved = model.solve(np.zeros(model.count)).jacobian(_observing_rows(observed))
     squares, vectors = np.linalg.eigh(moved.T @ moved)
     information = squares[::-1] * (rule.scale / rule.noise) ** 2 * rule.points
-    count = min(rule.most, max(int((information > rule.information).sum()), 1))
+    count = min(rule.maximum, max(int((information > rule.information).sum()), 1))
     return np.ascontiguousarray(vectors[:, ::-1][:, :count])
 
 
-def windowed(forces: Forces, where: Floats) -> Forces:
+def localised(forces: NodalForces, where: Floats) -> NodalForces:
     """The forces where they may act: each node's share of the basis times its part.
 
     Args:
@@ -216,7 +216,7 @@ def _parted_net(parts: Floats, patterns: Floats) -> Floats:
     return axes @ patterns
 
 
-def contact(forces: Forces, nodal: Floats, positions: Floats, reach: float, least: float = 0.02) -> Floats:
+def contact(forces: NodalForces, nodal: Floats, positions: Floats, reach: float, minimum: float = 0.02) -> Floats:
     """Where forces were found, as parts of the largest, (n,): the next prior of forces whose place is unknown.
 
     Repeated, forces gather where the cloud asks for them (re-weighted least squares: Gorodnitsky and Rao 1997).
@@ -226,14 +226,14 @@ def contact(forces: Forces, nodal: Floats, positions: Floats, reach: float, leas
         nodal: forces found, (n, 3), newtons.
         positions: of the nodes at rest, (n, 3), metres.
         reach: forces within this distance count together, metres.
-        least: no part is smaller: a force elsewhere stays possible.
+        minimum: no part is smaller: a force elsewhere stays possible.
     """
     place = positions[forces.nodes]
     size = np.linalg.norm(nodal[forces.nodes], axis=1)
     near = cKDTree(place).sparse_distance_matrix(cKDTree(place), 3.0 * reach, output_type="coo_matrix")
     smooth = coo_array((np.exp(-0.5 * (near.data / reach) ** 2), (near.row, near.col)), shape=near.shape) @ size
     where = np.zeros(len(positions))
-    where[forces.nodes] = np.maximum(smooth / max(smooth.max(), 1e-300), least)
+    where[forces.nodes] = np.maximum(smooth / max(smooth.max(), 1e-300), minimum)
     return where
 
 
@@ -255,26 +255,26 @@ class PosePrior:
     Args:
         mean: the pose expected.
         centre: of the turn, in the body's coordinates, (3,), metres.
-        turn: standard deviation of the turn about each axis, radians.
-        shift: standard deviation of the shift along each axis, metres.
+        rotation_deviation: standard deviation of the turn about each axis, radians.
+        translation_deviation: standard deviation of the shift along each axis, metres.
         is_said: the expected pose is the one that results are told in: what is found beside it counts as displacement.
     """
 
     mean: Pose
     centre: Floats
-    turn: float = np.deg2rad(5.0)
-    shift: float = 0.01
+    rotation_deviation: float = np.deg2rad(5.0)
+    translation_deviation: float = 0.01
     is_said: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("turn", "shift"):
+        for name in ("rotation_deviation", "translation_deviation"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"PosePrior.{name}: expected a positive deviation, got {getattr(self, name)}.")
 
     @property
     def deviations(self) -> Floats:
         """Of turn and shift, (6,)."""
-        return np.repeat([self.turn, self.shift], 3)
+        return np.repeat([self.rotation_deviation, self.translation_deviation], 3)
 
     def pose(self, coefficients: Floats) -> Pose:
         """The pose for coefficients of unit variance, (6,)."""

@@ -48,13 +48,13 @@ _NO_STEP = NewtonStep(np.inf, np.inf, None)
 
 
 @dataclass(frozen=True)
-class Signs:
+class ErrorIndicators:
     """What a prediction shows of its error.
 
     Args:
         distance: how far out the load lies in the network's own coordinates: 1 at the farthest of the training; None
             where that was not measured.
-        extent: likewise, and how far it moves the body (`SurrogateState.extent`).
+        extrapolation_ratio: likewise, and how far it moves the body (`SurrogateState.extrapolation_ratio`).
         is_inside: whether it lies among the loads that were learned, as that says; None likewise.
         unseen: nodes that it acts on though none did in training: the prediction leaves these forces out.
         load: how far out it lies among the training loads on the nodes that it acts on, and the number of components of
@@ -67,7 +67,7 @@ class Signs:
     """
 
     distance: float | None
-    extent: float | None
+    extrapolation_ratio: float | None
     is_inside: bool | None
     unseen: int
     load: tuple[float, int] | None
@@ -96,7 +96,7 @@ class Signs:
         return found
 
 
-class SignReader:
+class IndicatorReader:
     """What is out of balance in predictions for one body, and where a linear step would lead.
 
     The tangent at rest is factored once, when it is first wanted. No FEniCSx is needed.
@@ -112,7 +112,7 @@ class SignReader:
         learned = surrogate.learned_material
         if learned is None or learned["material"] not in MATERIALS:
             raise CalibrationError(
-                "SignReader.surrogate: expected a card that names the material of its equilibria, got "
+                "IndicatorReader.surrogate: expected a card that names the material of its equilibria, got "
                 f"{None if learned is None else learned['material']}; without it nothing is known of balance."
             )
         material = MATERIALS[learned["material"]](learned["young_modulus"], learned["poisson_ratio"])
@@ -136,7 +136,7 @@ class SignReader:
         options = {"SymmetricMode": True}
         return splu(tangent, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options), tangent
 
-    def read(self, forces: Floats, state: SurrogateState, newton: bool = False) -> Signs:
+    def read(self, forces: Floats, state: SurrogateState, newton: bool = False) -> ErrorIndicators:
         """What the prediction for nodal forces, (n, 3), newtons, shows of its error.
 
         Args:
@@ -149,9 +149,9 @@ class SignReader:
         gap = np.where(is_free, self._elastic.internal_forces(predicted[None])[0].numpy() - forces, 0.0)
         # Forces at fixed nodes move nothing: they count neither as out of balance nor as load.
         load, missing = float(np.linalg.norm(forces[is_free.all(axis=1)])), float(np.linalg.norm(gap))
-        seen = Signs(
+        seen = ErrorIndicators(
             distance=state.distance,
-            extent=state.extent,
+            extrapolation_ratio=state.extrapolation_ratio,
             is_inside=state.is_inside,
             unseen=len(self.surrogate.unseen(forces)),
             load=load_distance(self.surrogate, forces),
@@ -195,6 +195,6 @@ class SignReader:
         shares = of_cells[:, None].expand(-1, elastic.cells.shape[1], -1, -1).reshape(-1, 3, 3)
         mean = torch.zeros(len(displacement), 3, 3, dtype=shares.dtype)
         left, _, right = torch.linalg.svd(mean.index_add(0, elastic.cells.reshape(-1), shares))
-        signs = torch.ones(len(displacement), 3, dtype=shares.dtype)
-        signs[:, 2] = torch.linalg.det(left @ right)
-        return (left @ (signs[..., None] * right)).numpy()
+        indicators = torch.ones(len(displacement), 3, dtype=shares.dtype)
+        indicators[:, 2] = torch.linalg.det(left @ right)
+        return (left @ (indicators[..., None] * right)).numpy()

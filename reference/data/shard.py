@@ -13,7 +13,7 @@ from .lock import locked
 
 
 @dataclass(frozen=True)
-class Part:
+class Shard:
     """Every so-manieth block of a data set.
 
     Args:
@@ -26,10 +26,10 @@ class Part:
 
     def __post_init__(self) -> None:
         if not 0 <= self.number < self.count:
-            raise DataSetError(f"Part.number: expected 0..{self.count - 1} of {self.count} parts, got {self.number}.")
+            raise DataSetError(f"Shard.number: expected 0..{self.count - 1} of {self.count} parts, got {self.number}.")
 
     @classmethod
-    def parse(cls, text: str) -> Part:
+    def parse(cls, text: str) -> Shard:
         """A part from words like `3/16`: the fourth of sixteen.
 
         Raises:
@@ -49,7 +49,7 @@ class Part:
 
 
 @contextmanager
-def at_work_on(path: Path, part: Part) -> Iterator[None]:
+def at_work_on(path: Path, part: Shard) -> Iterator[None]:
     """Keep others from the same part of a data set.
 
     Raises:
@@ -60,7 +60,7 @@ def at_work_on(path: Path, part: Part) -> Iterator[None]:
         yield
 
 
-def refuse_parts_at_work(path: Path) -> None:
+def refuse_shards_at_work(path: Path) -> None:
     """Refuse to write a whole data set while others write parts of it.
 
     Raises:

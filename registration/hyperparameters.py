@@ -21,36 +21,38 @@ _SEEN = 1e-13  # information relative to the largest, below which a direction is
 
 
 @dataclass(frozen=True)
-class Scale:
+class LogNormalPrior:
     """What is believed of a positive scale beforehand: log-normal.
 
     Args:
         median: the scale expected.
         spread: standard deviation of its logarithm; 0 for a scale that is known.
-        least: no smaller value is believed.
+        minimum: no smaller value is believed.
     """
 
     median: float
     spread: float
-    least: float = 0.0
+    minimum: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.median < np.inf and 0.0 <= self.spread < np.inf and 0.0 <= self.least < np.inf):
-            raise ValueError(f"Scale: expected a positive median, a spread and a least value of 0 or more, got {self}.")
+        if not (0.0 < self.median < np.inf and 0.0 <= self.spread < np.inf and 0.0 <= self.minimum < np.inf):
+            raise ValueError(
+                f"LogNormalPrior: expected a positive median, a spread and a least value of 0 or more, got {self}."
+            )
 
-    def at_least(self, least: float) -> Scale:
+    def with_minimum(self, minimum: float) -> LogNormalPrior:
         """The same belief with a larger least value."""
-        return replace(self, least=max(self.least, least))
+        return replace(self, minimum=max(self.minimum, minimum))
 
     @cached_property
     def grid(self) -> tuple[Floats, Floats]:
         """Logarithms of values, multiples of one step, (g,), and the logarithm of their probability, (g,)."""
-        middle = np.log(max(self.median, self.least))
+        middle = np.log(max(self.median, self.minimum))
         if self.spread == 0.0:
             return np.round([middle / _STEP]) * _STEP, np.zeros(1)
         low = middle - _REACH * self.spread
-        if self.least > 0.0:
-            low = max(low, np.log(self.least))
+        if self.minimum > 0.0:
+            low = max(low, np.log(self.minimum))
         steps = np.arange(np.ceil(low / _STEP), np.floor((middle + _REACH * self.spread) / _STEP) + 1)
         return _STEP * steps, -0.5 * ((_STEP * steps - np.log(self.median)) / self.spread) ** 2
 
@@ -73,7 +75,7 @@ class Linearised:
     rest: float
     count: float
 
-    def promised(self, scales: Scales, coefficients: Floats) -> float:
+    def promised(self, scales: Hyperparameters, coefficients: Floats) -> float:
         """Root mean square change of the residuals by the best step at some scales, metres.
 
         Args:
@@ -131,7 +133,7 @@ def linearised(
 
 
 @dataclass(frozen=True, eq=False)
-class Scales:
+class Hyperparameters:
     """The two scales after the data.
 
     Args:
@@ -145,7 +147,7 @@ class Scales:
     spread: tuple[float, float]
 
 
-def find_scales(problem: Linearised, noise: Scale, force: Scale) -> Scales:
+def estimate_hyperparameters(problem: Linearised, noise: LogNormalPrior, force: LogNormalPrior) -> Hyperparameters:
     """Posterior geometric means of noise and force scale.
 
     Args:
@@ -161,8 +163,11 @@ def find_scales(problem: Linearised, noise: Scale, force: Scale) -> Scales:
     ratios = _STEP * np.arange(
         round((log_force[0] - log_noise[-1]) / _STEP), round((log_force[-1] - log_noise[0]) / _STEP) + 1
     )
-    growth = 1.0 + np.exp(2.0 * ratios)[:, None] * information
-    logarithms, explained = np.log(growth).sum(axis=1), (projections**2 / information / growth).sum(axis=1)
+    stiffness_scaling = 1.0 + np.exp(2.0 * ratios)[:, None] * information
+    logarithms, explained = (
+        np.log(stiffness_scaling).sum(axis=1),
+        (projections**2 / information / stiffness_scaling).sum(axis=1),
+    )
     index = np.arange(len(log_force))[None, :] - np.arange(len(log_noise))[:, None] + len(log_noise) - 1
     count = float(max(problem.count, len(information) + 1.0))
     chance = -0.5 * (logarithms[index] + (explained[index] + problem.rest) * np.exp(-2.0 * log_noise)[:, None])
@@ -171,7 +176,7 @@ def find_scales(problem: Linearised, noise: Scale, force: Scale) -> Scales:
     chance /= chance.sum()
     noise_found, noise_spread = _moments(log_noise, chance.sum(axis=1))
     force_found, force_spread = _moments(log_force, chance.sum(axis=0))
-    return Scales(float(np.exp(noise_found)), float(np.exp(force_found)), (noise_spread, force_spread))
+    return Hyperparameters(float(np.exp(noise_found)), float(np.exp(force_found)), (noise_spread, force_spread))
 
 
 def _moments(values: Floats, chance: Floats) -> tuple[float, float]:

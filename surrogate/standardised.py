@@ -12,14 +12,14 @@ from torch import Tensor, nn
 from softtwin.reference.data.dataset import DataSet, Samples
 
 from .architecture import Network
-from .maps import LinearMaps, no_response
+from .encoder_decoder import LinearEncoderDecoder, no_response
 
 Floats = NDArray[np.float64]
 
 _AT_ONCE = 256  # samples that are looked at together: a grid of many channels takes memory
 
 
-class ScaledLesson(nn.Module):
+class StandardisedObjective(nn.Module):
     """Scaled samples with the mean squared error as loss, for a network that a subclass brings.
 
     Forces and displacements are divided by one data scale factor each, the root mean square over the training split
@@ -109,7 +109,7 @@ class FieldNetwork(Network):
         raise NotImplementedError
 
 
-class FieldLesson(ScaledLesson):
+class FieldObjective(StandardisedObjective):
     """Scaled samples with a network between whole fields."""
 
     network: FieldNetwork
@@ -119,10 +119,10 @@ class FieldLesson(ScaledLesson):
         """Numbers of the loaded nodes, (l,)."""
         return torch.from_numpy(np.asarray(self.loaded, dtype=np.int64))
 
-    def maps(self) -> LinearMaps:
+    def encoder_decoder(self) -> LinearEncoderDecoder:
         """None: the network takes forces and gives displacements."""
         size, inputs = self.displacements.shape[1], self.forces.shape[1]
-        return LinearMaps(self.loaded, np.zeros(size), *no_response(size, inputs))
+        return LinearEncoderDecoder(self.loaded, np.zeros(size), *no_response(size, inputs))
 
     def trained(self) -> FieldNetwork:
         """The network as it is now in double precision, with the scale factors in it."""

@@ -19,23 +19,23 @@ _REACH = 0.5  # of the cloud's extent: farther apart, a fit leaves no correlatio
 _SURE = 2.0  # standard errors: a weaker correlation is none
 
 
-def inflation(feet: Floats, scaled: Floats, weights: Floats) -> float:
+def variance_inflation(closest_points: Floats, scaled: Floats, weights: Floats) -> float:
     """Factor by which the covariance of what a cloud tells is larger than for independent points, 1 or more.
 
     Args:
-        feet: places of the points on the surface at rest, (p, 3), metres.
+        closest_points: places of the points on the surface at rest, (p, 3), metres.
         scaled: residuals over their deviations, (p,).
         weights: of the points, (p,); those without weight are left out.
     """
     kept = weights > 0.05
-    places, values = feet[kept], scaled[kept]
+    places, values = closest_points[kept], scaled[kept]
     square = float((values**2).mean()) if len(values) else 0.0
-    extent = float(np.linalg.norm(np.ptp(places, axis=0))) if len(values) else 0.0
-    if len(values) < _RINGS or square == 0.0 or extent == 0.0:
+    extrapolation_ratio = float(np.linalg.norm(np.ptp(places, axis=0))) if len(values) else 0.0
+    if len(values) < _RINGS or square == 0.0 or extrapolation_ratio == 0.0:
         return 1.0
     asked = np.arange(0, len(values), max(1, len(values) // _ASKED))
     # Rings of equal area, so that each holds about as many points; the last is all that lies farther, or is itself.
-    squares = cdist(places[asked], places, "sqeuclidean") * (_RINGS / (_REACH * extent) ** 2)
+    squares = cdist(places[asked], places, "sqeuclidean") * (_RINGS / (_REACH * extrapolation_ratio) ** 2)
     squares[np.arange(len(asked)), asked] = _RINGS
     ring = np.minimum(squares, _RINGS).astype(np.int64).ravel()
     pairs = np.bincount(ring, minlength=_RINGS + 1)[:_RINGS]

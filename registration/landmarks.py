@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from .loss import Huber
-from .residuals import Match, SurfaceDistance
+from .residuals import Correspondence, SurfaceDistance
 
 Floats = NDArray[np.float64]
 LOSS = Huber()  # a landmark may have been taken for another
@@ -17,21 +17,23 @@ _REACH = 0.05  # of the body's size: further off the observed side a point is no
 
 
 @dataclass(frozen=True, eq=False)
-class Marks:
+class LandmarkPairs:
     """Points of the observed side at rest, and where each of them is now.
 
     Args:
-        feet: where they lie on the observed side at rest.
+        closest_points: where they lie on the observed side at rest.
         places: where they were found, in the clouds' coordinates, (l, 3), metres.
         deviation: standard deviation of each coordinate of a place, metres.
     """
 
-    feet: Match
+    closest_points: Correspondence
     places: Floats
     deviation: float
 
     @classmethod
-    def of(cls, observed: SurfaceDistance, points: ArrayLike, places: ArrayLike, deviation: float = 2e-3) -> Marks:
+    def of(
+        cls, observed: SurfaceDistance, points: ArrayLike, places: ArrayLike, deviation: float = 2e-3
+    ) -> LandmarkPairs:
         """Landmarks of a body, each taken at the closest point of the observed side.
 
         Args:
@@ -51,19 +53,19 @@ class Marks:
             if not np.isfinite(values).all():
                 raise ValueError(f"Marks.{name}: expected finite numbers, got NaN or infinity.")
         if not 0.0 < deviation < np.inf:
-            raise ValueError(f"Marks.deviation: expected a positive number of metres, got {deviation}.")
-        feet = observed.match(np.zeros((len(observed.nodes), 3)), given[0])
-        far = np.abs(feet.distances)
+            raise ValueError(f"LandmarkPairs.deviation: expected a positive number of metres, got {deviation}.")
+        closest_points = observed.match(np.zeros((len(observed.nodes), 3)), given[0])
+        far = np.abs(closest_points.distances)
         if far.max() > _REACH * observed.body.size:
             raise ValueError(
-                f"Marks.points: expected points on the observed side at rest; point {int(far.argmax())} lies "
+                f"LandmarkPairs.points: expected points on the observed side at rest; point {int(far.argmax())} lies "
                 f"{1e3 * far.max():.0f} mm from it (in metres, and in the body's coordinates?)."
             )
-        return cls(feet, given[1], deviation)
+        return cls(closest_points, given[1], deviation)
 
     def __len__(self) -> int:
         return len(self.places)
 
     def rows(self, observed: SurfaceDistance) -> csr_array:
         """Derivative of the points' coordinates by the displacement of the observed nodes, (3l, 3m)."""
-        return observed.rows_by_axes(self.feet)
+        return observed.rows_by_axes(self.closest_points)

@@ -22,7 +22,7 @@ from .pose import Pose
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-LEAST_MODULUS = 10.0  # pascals: nothing softer is an organ
+MINIMUM_MODULUS = 10.0  # pascals: nothing softer is an organ
 LOWEST_RATIO, HIGHEST_RATIO = 0.2, 0.5  # open ends (Odot 2023, figure 7.27)
 WITHIN_90 = 1.6449  # deviations of a normal law that hold 90 %
 _STRIDE = {"modulus": np.log(10.0), "ratio": 1.5, "turn": 0.3}  # largest change in one step
@@ -49,7 +49,7 @@ class Estimate:
     deviations: float
 
 
-class Condition(Protocol):
+class ParameterBlock(Protocol):
     """One unknown: coefficients of unit variance to a part of the inputs."""
 
     @property
@@ -81,7 +81,7 @@ class Condition(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Stiffness:
+class YoungModulus:
     """Young's modulus of a body or of a region: E = 10 Pa + (E0 - 10 Pa) exp(s c) with E0 that the body has.
 
     Args:
@@ -118,7 +118,7 @@ class Stiffness:
         return _with(inputs, young_modulus=self._there(before, self._modulus(before, coefficients[0])))
 
     def _modulus(self, median: Parameter, coefficient: float) -> Parameter:
-        grown = LEAST_MODULUS + (np.asarray(median) - LEAST_MODULUS) * np.exp(self.deviation * coefficient)
+        grown = MINIMUM_MODULUS + (np.asarray(median) - MINIMUM_MODULUS) * np.exp(self.deviation * coefficient)
         return grown if grown.ndim else float(grown)
 
     def _there(self, elsewhere: Parameter, here: Parameter) -> Parameter:
@@ -131,7 +131,7 @@ class Stiffness:
     def changes(self, inputs: Inputs, coefficients: Floats, body: Body) -> list[Change]:
         """Derivative by the coefficient, (cells,)."""
         whole = np.broadcast_to(inputs.parameters["young_modulus"], (len(body.cells),))
-        slope = self.deviation * (whole - LEAST_MODULUS)
+        slope = self.deviation * (whole - MINIMUM_MODULUS)
         return [Change(parameters={"young_modulus": self._there(np.zeros(len(body.cells)), slope)})]
 
     def estimates(self, inputs: Inputs, mean: Floats, covariance: Floats) -> list[Estimate]:
@@ -156,7 +156,7 @@ class Stiffness:
         """The modulus as a function of the logarithm by which it grows."""
         median = np.asarray(inputs.parameters["young_modulus"])
         chosen = median if self.cells is None or not median.ndim else median[self.cells]
-        return lambda change: float(np.mean(LEAST_MODULUS + (chosen - LEAST_MODULUS) * np.exp(change)))
+        return lambda change: float(np.mean(MINIMUM_MODULUS + (chosen - MINIMUM_MODULUS) * np.exp(change)))
 
 
 @dataclass(frozen=True)
@@ -215,22 +215,22 @@ class PoissonRatio:
 
 
 @dataclass(frozen=True)
-class Moved:
+class PrescribedMotion:
     """A node set that is moved as a rigid whole: what grips it, a support that has shifted.
 
     Args:
         name: of the node set; the model's problem holds all its axes.
-        turn: standard deviation of the turn about each axis, radians.
-        shift: of the shift along each axis, metres.
+        rotation_deviation: standard deviation of the turn about each axis, radians.
+        translation_deviation: of the shift along each axis, metres.
     """
 
     name: str
-    turn: float = 0.2
-    shift: float = 0.01
+    rotation_deviation: float = 0.2
+    translation_deviation: float = 0.01
 
     def __post_init__(self) -> None:
-        check_deviation("Moved.turn", self.turn)
-        check_deviation("Moved.shift", self.shift)
+        check_deviation("PrescribedMotion.rotation_deviation", self.rotation_deviation)
+        check_deviation("PrescribedMotion.translation_deviation", self.translation_deviation)
 
     @property
     def is_force(self) -> bool:
@@ -245,10 +245,10 @@ class Moved:
     @property
     def strides(self) -> Floats:
         """Largest changes of the coefficients in one step; shifts are held by how far nodes may move."""
-        return np.repeat([_STRIDE["turn"] / self.turn, np.inf], 3)
+        return np.repeat([_STRIDE["turn"] / self.rotation_deviation, np.inf], 3)
 
     def _twist(self, coefficients: Floats) -> Floats:
-        return np.repeat([self.turn, self.shift], 3) * coefficients
+        return np.repeat([self.rotation_deviation, self.translation_deviation], 3) * coefficients
 
     def _places(self, body: Body) -> tuple[Floats, Floats]:
         places = body.points[body.node_sets[self.name]]
@@ -265,7 +265,7 @@ class Moved:
         places, centre = self._places(body)
         columns = Pose.identity().moved_jacobian(places, self._twist(coefficients), centre)
         found = []
-        for column in (columns * np.repeat([self.turn, self.shift], 3)).T:
+        for column in (columns * np.repeat([self.rotation_deviation, self.translation_deviation], 3)).T:
             whole = np.zeros_like(body.points)
             whole[body.node_sets[self.name]] = column.reshape(-1, 3)
             found.append(Change(displacement=whole))
@@ -275,7 +275,7 @@ class Moved:
         """Turn, radians, and shift, metres, about and along each axis."""
         found = []
         for place, (kind, axis) in enumerate((kind, axis) for kind in ("turn", "shift") for axis in "xyz"):
-            scale, unit = (self.turn, "rad") if kind == "turn" else (self.shift, "m")
+            scale, unit = (self.rotation_deviation, "rad") if kind == "turn" else (self.translation_deviation, "m")
 
             def at(c: float, scale: float = scale) -> float:
                 return scale * c
@@ -286,13 +286,13 @@ class Moved:
 
 
 @dataclass(frozen=True, eq=False)
-class Conditions:
+class ParameterBlocks:
     """Several unknowns beside the forces.
 
     Args:
         body: the body.
         parameters: of its material, by name: what is expected of them beforehand.
-        unknowns: each once.
+        blocks: each once.
 
     Raises:
         ValueError: a parameter that the material does not have, a region of no cells, a ratio out of its map, a set of
@@ -301,56 +301,58 @@ class Conditions:
 
     body: Body
     parameters: Mapping[str, Parameter]
-    unknowns: tuple[Condition, ...]
+    blocks: tuple[ParameterBlock, ...]
     count: int = field(init=False)
 
     def __post_init__(self) -> None:
-        for unknown in self.unknowns:
+        for unknown in self.blocks:
             self._check(unknown)
-        names = [_name(unknown) for unknown in self.unknowns]
+        names = [_name(unknown) for unknown in self.blocks]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"Conditions.unknowns: expected each unknown once, got {', '.join(twice)} several times.")
-        object.__setattr__(self, "count", sum(unknown.count for unknown in self.unknowns))
+            raise ValueError(
+                f"ParameterBlocks.blocks: expected each unknown once, got {', '.join(twice)} several times."
+            )
+        object.__setattr__(self, "count", sum(unknown.count for unknown in self.blocks))
 
-    def _check(self, unknown: Condition) -> None:
-        for kind, name in ((Stiffness, "young_modulus"), (PoissonRatio, "poisson_ratio")):
+    def _check(self, unknown: ParameterBlock) -> None:
+        for kind, name in ((YoungModulus, "young_modulus"), (PoissonRatio, "poisson_ratio")):
             if isinstance(unknown, kind) and name not in self.parameters:
                 raise ValueError(
-                    f"Conditions.unknowns: expected unknowns of a material with {sorted(self.parameters)}, got "
+                    f"ParameterBlocks.blocks: expected unknowns of a material with {sorted(self.parameters)}, got "
                     f"{kind.__name__}, which needs {name}."
                 )
-        if isinstance(unknown, Stiffness):
+        if isinstance(unknown, YoungModulus):
             self._check_stiffness(unknown)
         if isinstance(unknown, PoissonRatio):
             ratios = np.asarray(self.parameters["poisson_ratio"])
             if not ((ratios > LOWEST_RATIO) & (ratios < HIGHEST_RATIO)).all():
                 raise ValueError(
-                    f"Conditions.parameters: expected a Poisson's ratio within ]{LOWEST_RATIO}, {HIGHEST_RATIO}[ where "
+                    f"ParameterBlocks.parameters: expected a Poisson's ratio within ]{LOWEST_RATIO}, {HIGHEST_RATIO}[ where "
                     f"it is unknown, got {ratios.min():g} to {ratios.max():g}."
                 )
-        if isinstance(unknown, Moved) and unknown.name not in self.body.node_sets:
+        if isinstance(unknown, PrescribedMotion) and unknown.name not in self.body.node_sets:
             raise ValueError(
-                f"Moved.name: expected a node set among {sorted(self.body.node_sets)}, got {unknown.name!r}."
+                f"PrescribedMotion.name: expected a node set among {sorted(self.body.node_sets)}, got {unknown.name!r}."
             )
 
-    def _check_stiffness(self, unknown: Stiffness) -> None:
+    def _check_stiffness(self, unknown: YoungModulus) -> None:
         moduli = np.asarray(self.parameters["young_modulus"])
-        if moduli.min() <= LEAST_MODULUS:
+        if moduli.min() <= MINIMUM_MODULUS:
             raise ValueError(
-                f"Conditions.parameters: expected a Young's modulus above {LEAST_MODULUS:g} Pa where it is unknown, "
+                f"ParameterBlocks.parameters: expected a Young's modulus above {MINIMUM_MODULUS:g} Pa where it is unknown, "
                 f"got {moduli.min():g} Pa."
             )
         if unknown.cells is None:
             return
         if len(unknown.cells) == 0 or unknown.cells.min() < 0 or unknown.cells.max() >= len(self.body.cells):
             raise ValueError(
-                f"Stiffness.cells: expected numbers of at least one of the body's {len(self.body.cells)} cells, "
+                f"YoungModulus.cells: expected numbers of at least one of the body's {len(self.body.cells)} cells, "
                 f"got {len(unknown.cells)} of them."
             )
         if moduli.ndim == 0:
             raise ValueError(
-                "Conditions.parameters: expected one Young's modulus for each cell where a region's is unknown, "
+                "ParameterBlocks.parameters: expected one Young's modulus for each cell where a region's is unknown, "
                 "got one for all."
             )
 
@@ -363,12 +365,12 @@ class Conditions:
     @property
     def moved(self) -> Ints:
         """Numbers of the nodes whose displacement is prescribed, sorted."""
-        names = [unknown.name for unknown in self.unknowns if isinstance(unknown, Moved)]
+        names = [unknown.name for unknown in self.blocks if isinstance(unknown, PrescribedMotion)]
         return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(self.body.node_sets[name] for name in names)]))
 
-    def _parts(self, coefficients: Floats) -> list[tuple[Condition, Floats]]:
-        ends = np.cumsum([unknown.count for unknown in self.unknowns])
-        return list(zip(self.unknowns, np.split(coefficients, ends[:-1]), strict=True))
+    def _parts(self, coefficients: Floats) -> list[tuple[ParameterBlock, Floats]]:
+        ends = np.cumsum([unknown.count for unknown in self.blocks])
+        return list(zip(self.blocks, np.split(coefficients, ends[:-1]), strict=True))
 
     def inputs(self, coefficients: Floats) -> Inputs:
         """The inputs at coefficients, (count,)."""
@@ -388,13 +390,13 @@ class Conditions:
     def modulus(self) -> tuple[int, float] | None:
         """Place and deviation of the coefficient of the whole body's Young's modulus; None where that is no unknown."""
         begin = 0
-        for unknown in self.unknowns:
-            if isinstance(unknown, Stiffness) and unknown.cells is None:
+        for unknown in self.blocks:
+            if isinstance(unknown, YoungModulus) and unknown.cells is None:
                 return begin, unknown.deviation
             begin += unknown.count
         return None
 
-    def growth(self, coefficients: Floats) -> tuple[float, Floats]:
+    def stiffness_scaling(self, coefficients: Floats) -> tuple[float, Floats]:
         """Factor by which forces grow with the whole body's Young's modulus, and its derivative, (count,).
 
         Forces are expected of a size for a stiffness: a body twice as stiff is pulled at twice as hard. Were they
@@ -407,15 +409,15 @@ class Conditions:
         if modulus is None:
             return 1.0, slopes
         place, deviation = modulus
-        least = LEAST_MODULUS / float(np.mean(self.parameters["young_modulus"]))
-        grown = (1.0 - least) * float(np.exp(deviation * coefficients[place]))
+        minimum = MINIMUM_MODULUS / float(np.mean(self.parameters["young_modulus"]))
+        grown = (1.0 - minimum) * float(np.exp(deviation * coefficients[place]))
         slopes[place] = deviation * grown
-        return least + grown, slopes
+        return minimum + grown, slopes
 
     @property
     def has_regions(self) -> bool:
         """Whether the stiffness of a part of the body is an unknown of its own."""
-        return any(isinstance(unknown, Stiffness) and unknown.cells is not None for unknown in self.unknowns)
+        return any(isinstance(unknown, YoungModulus) and unknown.cells is not None for unknown in self.blocks)
 
     def shares(self, direction: Floats) -> Floats:
         """How far each unknown's own value goes along a direction of the coefficients, in its deviations beforehand.
@@ -426,8 +428,8 @@ class Conditions:
             direction: (count,).
         """
         found, begin, modulus = direction.copy(), 0, self.modulus
-        for unknown in self.unknowns:
-            if isinstance(unknown, Stiffness) and modulus is not None and unknown.cells is not None:
+        for unknown in self.blocks:
+            if isinstance(unknown, YoungModulus) and modulus is not None and unknown.cells is not None:
                 both = np.array([unknown.deviation, modulus[1]])
                 found[begin] = both @ direction[[begin, modulus[0]]] / np.linalg.norm(both)
             begin += unknown.count
@@ -436,7 +438,7 @@ class Conditions:
     @property
     def has_forces_alone(self) -> bool:
         """Whether every forward model takes them."""
-        return all(unknown.is_force for unknown in self.unknowns)
+        return all(unknown.is_force for unknown in self.blocks)
 
     def forces(self, coefficients: Floats) -> Floats:
         """Nodal forces among the inputs, (n, 3), newtons."""
@@ -451,7 +453,7 @@ class Conditions:
 
     def is_too_far(self, change: Floats) -> bool:
         """Whether a change of the coefficients is more than one step may make."""
-        strides = np.concatenate([unknown.strides for unknown in self.unknowns])
+        strides = np.concatenate([unknown.strides for unknown in self.blocks])
         return bool((np.abs(change) > strides).any())
 
     def estimates(self, mean: Floats, covariance: Floats) -> tuple[Estimate, ...]:
@@ -465,7 +467,7 @@ class Conditions:
         for unknown, part in self._parts(mean):
             own = slice(begin, begin + unknown.count)
             each = unknown.estimates(self.expected, part, covariance[own, own])
-            if isinstance(unknown, Stiffness) and modulus is not None and unknown.cells is not None:
+            if isinstance(unknown, YoungModulus) and modulus is not None and unknown.cells is not None:
                 along = np.zeros(self.count)
                 along[begin], along[modulus[0]] = unknown.deviation, modulus[1]
                 law = float(along @ mean), float(along @ covariance @ along)
@@ -479,7 +481,7 @@ def _with(inputs: Inputs, **parameters: Parameter) -> Inputs:
     return replace(inputs, parameters={**inputs.parameters, **parameters})
 
 
-def _name(unknown: Condition) -> str:
+def _name(unknown: ParameterBlock) -> str:
     return f"{type(unknown).__name__} {getattr(unknown, 'name', '')}".strip()
 
 

@@ -15,7 +15,7 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class LinearMaps:
+class LinearEncoderDecoder:
     """The linear maps around a network N: u = offset + left right b + decode N(encode b).
 
     Args:
@@ -49,7 +49,7 @@ class LinearMaps:
         named = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return {name: array for name, array in named.items() if array is not None}
 
-    def rounded(self) -> LinearMaps:
+    def rounded(self) -> LinearEncoderDecoder:
         """The same in single precision, for half of the memory traffic."""
         single: dict[str, Any] = {
             name: array.astype(np.float32) for name, array in self.arrays().items() if name != "loaded"

@@ -41,7 +41,7 @@ _FINENESS, _FEWEST_NODES = 2.0, 60  # nodes of the finest other mesh, over the m
 
 
 @dataclass(frozen=True)
-class Alternatives:
+class ModelErrorEnsemble:
     """How else an organ may be than its model: a prior.
 
     Args:
@@ -61,14 +61,16 @@ class Alternatives:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.attachment < np.inf:
-            raise ValueError(f"Alternatives.attachment: expected a length of 0 m or more, got {self.attachment}.")
+            raise ValueError(f"ModelErrorEnsemble.attachment: expected a length of 0 m or more, got {self.attachment}.")
         ratio = self.poisson_ratio
         if ratio is not None and not 0.0 <= ratio[0] <= ratio[1] < 0.5:
-            raise ValueError(f"Alternatives.poisson_ratio: expected 0 <= least <= largest < 0.5, got {ratio}.")
+            raise ValueError(f"ModelErrorEnsemble.poisson_ratio: expected 0 <= least <= largest < 0.5, got {ratio}.")
         if self.meshes < 0:
-            raise ValueError(f"Alternatives.meshes: expected 0 or more, got {self.meshes}.")
+            raise ValueError(f"ModelErrorEnsemble.meshes: expected 0 or more, got {self.meshes}.")
         if self.attachment == 0.0 and ratio is None and self.meshes == 0:
-            raise ValueError("Alternatives: expected something that may be otherwise than in the model, got nothing.")
+            raise ValueError(
+                "ModelErrorEnsemble: expected something that may be otherwise than in the model, got nothing."
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +88,7 @@ class Differences:
 
 def differences(
     path: Path | str | None,
-    alternatives: Alternatives | None,
+    ensemble: ModelErrorEnsemble | None,
     count: int = 64,
     seed: int = 0,
     comm: Any = MPI.COMM_WORLD,
@@ -97,7 +99,7 @@ def differences(
 
     Args:
         path: folder of the data set, whose training split is finished; as the alternatives read on rank 0 alone.
-        alternatives: what may be otherwise.
+        ensemble: what may be otherwise.
         count: draws.
         seed: of the draws.
         comm: the ranks that share the work.
@@ -112,28 +114,28 @@ def differences(
     """
     with threadpool_limits(1), ExitStack() as held:
 
-        def prepare() -> tuple[str, Path, Alternatives, list[int]]:
-            assert path is not None and alternatives is not None, "rank 0 gives both"
+        def prepare() -> tuple[str, Path, ModelErrorEnsemble, list[int]]:
+            assert path is not None and ensemble is not None, "rank 0 gives both"
             if count < 1:
                 raise ValueError(f"differences.count: expected at least 1, got {count}.")
             data = DataSet(path)
             data.check_complete("train")
-            if alternatives.attachment or alternatives.meshes:
+            if ensemble.attachment or ensemble.meshes:
                 shifted(data.body, np.zeros(3))
-            if alternatives.meshes and data.body.cells.shape[1] != 4:
+            if ensemble.meshes and data.body.cells.shape[1] != 4:
                 raise ValueError(
-                    "Alternatives.meshes: expected a body of linear tetrahedra, which are made anew, got cells of "
+                    "ModelErrorEnsemble.meshes: expected a body of linear tetrahedra, which are made anew, got cells of "
                     f"{data.body.cells.shape[1]} nodes."
                 )
             held.enter_context(writing(Path(path)))
-            folder = _folder(data, alternatives, seed)
-            _mesh_anew(data.body, alternatives.meshes, folder)
+            folder = _folder(data, ensemble, seed)
+            _mesh_anew(data.body, ensemble.meshes, folder)
             blocks = [block for block in range(-(-count // _BLOCK)) if not _file(folder, block).exists()]
-            return str(path), folder, alternatives, blocks
+            return str(path), folder, ensemble, blocks
 
         found = on_first(comm, prepare)
         first = comm.bcast(None if found is None else found[:3], root=0)
-        task = partial(difference_block, folder=first[1], alternatives=first[2], seed=seed)
+        task = partial(difference_block, folder=first[1], ensemble=first[2], seed=seed)
         share_out(task, first[0], found[3] if found else [], comm, "alternatives")
         return None if found is None else _read(found[1], count)
 
@@ -147,21 +149,21 @@ def forget(path: Path | str) -> None:
     shutil.rmtree(Path(path).parent / "doubt", ignore_errors=True)
 
 
-def difference_block(path: str, block: int, folder: Path, alternatives: Alternatives, seed: int) -> int:
+def difference_block(path: str, block: int, folder: Path, ensemble: ModelErrorEnsemble, seed: int) -> int:
     """Draw, solve and write a few alternatives; returns their block's number.
 
     Args:
         path: folder of the data set.
         block: number of the block.
         folder: where its file goes.
-        alternatives: what may be otherwise.
+        ensemble: what may be otherwise.
         seed: of the draws.
     """
     data, samples, plan = _opened(path, (Path(path) / "zarr.json").stat().st_mtime_ns)
     draws = range(block * _BLOCK, (block + 1) * _BLOCK)
-    others = tuple(_carried(data, _mesh_file(folder, number)) for number in range(alternatives.meshes))
+    others = tuple(_carried(data, _mesh_file(folder, number)) for number in range(ensemble.meshes))
     with threadpool_limits(1):
-        each = [_difference(data, samples, plan, alternatives, others, draw, seed) for draw in draws]
+        each = [_difference(data, samples, plan, ensemble, others, draw, seed) for draw in draws]
     missing = np.full(data.body.points.size, np.nan)
     partial_file = folder / f".{block}.partial.npy"
     np.save(partial_file, np.stack([missing if error is None else error for error in each]))
@@ -180,7 +182,7 @@ def _difference(
     data: DataSet,
     samples: Samples,
     plan: Plan,
-    alternatives: Alternatives,
+    ensemble: ModelErrorEnsemble,
     others: tuple[tuple[Body, Embedding], ...],
     draw: int,
     seed: int,
@@ -193,21 +195,21 @@ def _difference(
     body, known = data.body, samples.displacements[place]
     forces = np.zeros_like(body.points)
     forces[data.response.loaded] = samples.forces[place]
-    shift = alternatives.attachment * rng.standard_normal(3) if alternatives.attachment else np.zeros(3)
+    shift = ensemble.attachment * rng.standard_normal(3) if ensemble.attachment else np.zeros(3)
     carrier = None
     if others:
         body, carrier = others[int(rng.integers(len(others)))]
         forces = np.asarray(carrier.matrix.T @ forces)
-    if alternatives.attachment or carrier is not None:
+    if ensemble.attachment or carrier is not None:
         held = shifted(data.body, shift, body)
         if len(held) < _LEAST_HELD:
             return None
-        if carrier is None and alternatives.poisson_ratio is None and np.array_equal(held, body.fixed):
+        if carrier is None and ensemble.poisson_ratio is None and np.array_equal(held, body.fixed):
             return np.zeros(body.points.size)
         body = body.with_sets(fixed=held)
         forces[held] = 0.0
-    if alternatives.poisson_ratio is not None:
-        plan = replace(plan, poisson_ratio=float(rng.uniform(*alternatives.poisson_ratio)))
+    if ensemble.poisson_ratio is not None:
+        plan = replace(plan, poisson_ratio=float(rng.uniform(*ensemble.poisson_ratio)))
     try:
         with Problem(body, plan.build_material(), plan.newton) as problem:
             found = problem.solve(forces, stability=False).displacement
@@ -264,9 +266,9 @@ def _carried(data: DataSet, file: Path) -> tuple[Body, Embedding]:
     return _carried_as(file, file.stat().st_mtime_ns, data.body)
 
 
-def _folder(data: DataSet, alternatives: Alternatives, seed: int) -> Path:
+def _folder(data: DataSet, ensemble: ModelErrorEnsemble, seed: int) -> Path:
     """Where the blocks of these draws lie; those of others are thrown away."""
-    words = json.dumps([data.identity, asdict(alternatives), seed])
+    words = json.dumps([data.identity, asdict(ensemble), seed])
     parent = data.path.parent / "doubt"
     folder = parent / hashlib.sha256(words.encode()).hexdigest()[:16]
     if not folder.is_dir():

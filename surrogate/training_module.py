@@ -117,23 +117,25 @@ class Batches:
             waiting = waiting[self.batch :]
 
 
-class Course(lightning.LightningModule):
+class TrainingModule(lightning.LightningModule):
     """A lesson under Lightning: one epoch is a round; the best weights on the validation split are kept.
 
     A round is a part of the steps, or of the time by the clock; it holds at least one step.
 
     Args:
-        lesson: network, data and loss.
+        objective: network, data and loss.
         plan: how to train.
         mark: fingerprint of the data.
         clock: seconds since whenever.
     """
 
-    def __init__(self, lesson: Any, plan: TrainingPlan, mark: str, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, objective: Any, plan: TrainingPlan, mark: str, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         super().__init__()
-        self.lesson = lesson
+        self.objective = objective
         self.plan, self.mark, self.clock = plan, mark, clock
-        self.steps = _count_steps(plan, lesson.sample_count)
+        self.steps = _count_steps(plan, objective.sample_count)
         self.rounds = ROUNDS if self.steps is None else min(ROUNDS, self.steps)
         self.best: dict[str, Tensor] = {}
         self.best_error = math.inf
@@ -158,11 +160,11 @@ class Course(lightning.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """The architecture's."""
-        return self.plan.architecture.optimizer(self.lesson.network, self.plan.rate)
+        return self.plan.architecture.optimizer(self.objective.network, self.plan.rate)
 
     def train_dataloader(self) -> Batches:
         """Sample numbers of the steps of the current round."""
-        count = self.lesson.sample_count
+        count = self.objective.sample_count
         steps = _ENDLESS if self.steps is None else self.steps // self.rounds
         part = (self.global_rank, self.trainer.world_size)
         return Batches(count, self.plan.batch_size(count), steps, self.plan.seed, self.current_epoch, part)
@@ -189,13 +191,13 @@ class Course(lightning.LightningModule):
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
         """Loss of one batch."""
-        loss: Tensor = self.lesson.loss(batch)
+        loss: Tensor = self.objective.loss(batch)
         self._loss, self._count = self._loss.to(loss.device) + loss.detach(), self._count + 1
         return loss
 
     def on_train_epoch_end(self) -> None:
         """Look at the validation split and keep the weights if they are the best so far."""
-        error = self.lesson.error()
+        error = self.objective.error()
         self._look()
         if not math.isfinite(error):
             raise Diverged(
@@ -206,7 +208,7 @@ class Course(lightning.LightningModule):
         self.stale += 1
         if error < self.best_error:
             self.best_error, self.stale = error, 0
-            self.best = {name: value.detach().clone() for name, value in self.lesson.network.state_dict().items()}
+            self.best = {name: value.detach().clone() for name, value in self.objective.network.state_dict().items()}
         if self.share >= 1.0 or self.stale == self.plan.patience:
             self.trainer.should_stop = True
 
@@ -251,11 +253,11 @@ class Course(lightning.LightningModule):
         """Take it back."""
         self.take_back(checkpoint["course"])
 
-    def take_back(self, course: dict[str, Any]) -> None:
+    def take_back(self, training_module: dict[str, Any]) -> None:
         """Go on from what `on_save_checkpoint` added."""
         for name in ("best", "best_error", "seconds", "steps_made"):
-            setattr(self, name, course[name])
-        self.stale = course.get("stale", 0)
+            setattr(self, name, training_module[name])
+        self.stale = training_module.get("stale", 0)
 
 
 class _Progress(Callback):
@@ -284,16 +286,16 @@ class _Progress(Callback):
             self._bar.close()
 
 
-def fit(course: Course, path: Path, resume: bool, log: bool = False) -> None:
+def fit(training_module: TrainingModule, path: Path, resume: bool, log: bool = False) -> None:
     """Train to the end of the plan; every round leaves a checkpoint. In single precision a GPU multiplies without TF32.
 
     Args:
-        course: what to train.
+        training_module: what to train.
         path: of the checkpoint.
         resume: go on from it.
         log: leave a line for each round beside it, as CSV and for TensorBoard, in a folder of its own for each run.
     """
-    device, is_single = chosen_device(course.plan), course.plan.precision == "single"
+    device, is_single = chosen_device(training_module.plan), training_module.plan.precision == "single"
     kernels = without_onednn(device == "cpu" and not is_single)
     with _quiet(), _interruptible(), without_tf32(is_single), kernels:
         keeper = ModelCheckpoint(
@@ -302,15 +304,15 @@ def fit(course: Course, path: Path, resume: bool, log: bool = False) -> None:
             save_on_train_epoch_end=True,
             enable_version_counter=False,
         )
-        several = course.plan.processes > 1
+        several = training_module.plan.processes > 1
         trainer = lightning.Trainer(
             accelerator="gpu" if device == "cuda" else "cpu",
-            devices=course.plan.processes,
+            devices=training_module.plan.processes,
             strategy=_together(device) if several else "auto",
-            precision="bf16-mixed" if course.plan.precision == "mixed" else "32-true",
+            precision="bf16-mixed" if training_module.plan.precision == "mixed" else "32-true",
             use_distributed_sampler=False,
             plugins=LightningEnvironment(),  # else it looks for MPI and starts it
-            max_epochs=course.rounds,
+            max_epochs=training_module.rounds,
             reload_dataloaders_every_n_epochs=1,
             callbacks=[keeper, _Progress()],
             logger=_logs(path.parent) if log else False,
@@ -318,9 +320,9 @@ def fit(course: Course, path: Path, resume: bool, log: bool = False) -> None:
             enable_model_summary=False,
             default_root_dir=path.parent,
         )
-        trainer.fit(course, ckpt_path=path if resume else None)
+        trainer.fit(training_module, ckpt_path=path if resume else None)
     if several:  # what the others did is in the checkpoint alone
-        course.take_back(torch.load(path, map_location="cpu", weights_only=True)["course"])
+        training_module.take_back(torch.load(path, map_location="cpu", weights_only=True)["course"])
 
 
 def _together(device: str) -> DDPStrategy:

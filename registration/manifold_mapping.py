@@ -16,7 +16,7 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Anchored:
+class ManifoldMapping:
     """A reduced model whose states are moved by what it was wrong by at one of them, in place and in slope.
 
     At the anchor it is the exact model to first order. A minimum found with it is the exact model's, once no step leads
@@ -25,42 +25,44 @@ class Anchored:
     Args:
         fast: the fast model.
         nodes: numbers of its chosen nodes, (p,).
-        anchor: coefficients there, (k,).
+        expansion_point: coefficients there, (k,).
         offset: what is added to all displacements, (n, 3), metres.
         slopes: what is added to the derivatives of the chosen ones, (3p, k).
     """
 
     fast: ReducedModel
     nodes: Ints
-    anchor: Floats
+    expansion_point: Floats
     offset: Floats
     slopes: Floats
 
     @classmethod
-    def at(cls, fast: ReducedModel, nodes: Ints, anchor: Floats, exact: ReducedState) -> Anchored:
+    def at(cls, fast: ReducedModel, nodes: Ints, expansion_point: Floats, exact: ReducedState) -> ManifoldMapping:
         """Moved to an exact state, seen at the same nodes, of coefficients (k,)."""
-        own, every = fast.solve(anchor), csr_array(eye(3 * len(nodes)))
+        own, every = fast.solve(expansion_point), csr_array(eye(3 * len(nodes)))
         offset = exact.full.displacement - own.full.displacement
-        return cls(fast, nodes, anchor, offset, exact.jacobian(every) - own.jacobian(every))
+        return cls(fast, nodes, expansion_point, offset, exact.jacobian(every) - own.jacobian(every))
 
     @property
     def count(self) -> int:
         """Number of coefficients."""
         return self.fast.count
 
-    def combined(self, matrix: Floats) -> Anchored:
+    def combined(self, matrix: Floats) -> ManifoldMapping:
         """The same for other combinations of the forces: the anchor is the nearest of theirs."""
-        anchor = np.linalg.lstsq(matrix, self.anchor, rcond=None)[0]
-        return Anchored(self.fast.combined(matrix), self.nodes, anchor, self.offset, self.slopes @ matrix)
+        expansion_point = np.linalg.lstsq(matrix, self.expansion_point, rcond=None)[0]
+        return ManifoldMapping(
+            self.fast.combined(matrix), self.nodes, expansion_point, self.offset, self.slopes @ matrix
+        )
 
-    def solve(self, coefficients: Floats, near: Any = None) -> AnchoredState:
+    def solve(self, coefficients: Floats, near: Any = None) -> ManifoldMappingState:
         """The fast model's state for coefficients, (k,), moved."""
-        start = near.own if isinstance(near, AnchoredState) else None
-        return AnchoredState(self, coefficients, self.fast.solve(coefficients, start))
+        start = near.own if isinstance(near, ManifoldMappingState) else None
+        return ManifoldMappingState(self, coefficients, self.fast.solve(coefficients, start))
 
 
 @dataclass(frozen=True, eq=False)
-class AnchoredState:
+class ManifoldMappingState:
     """A reduced state that is moved.
 
     Args:
@@ -69,20 +71,20 @@ class AnchoredState:
         own: the fast model's.
     """
 
-    model: Anchored
+    model: ManifoldMapping
     coefficients: Floats
     own: ReducedState
 
     @property
     def positions(self) -> Floats:
         """Displacement of the chosen nodes, (p, 3), metres."""
-        turned = self.model.slopes @ (self.coefficients - self.model.anchor)
+        turned = self.model.slopes @ (self.coefficients - self.model.expansion_point)
         return self.own.positions + self.model.offset[self.model.nodes] + turned.reshape(-1, 3)
 
     @property
-    def full(self) -> Shifted:
+    def full(self) -> CorrectedState:
         """The whole state, without what the slopes add."""
-        return Shifted(self.own.full, self.model.offset)
+        return CorrectedState(self.own.full, self.model.offset)
 
     def jacobian(self, rows: csr_array) -> Floats:
         """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p)."""
@@ -95,7 +97,7 @@ class AnchoredState:
 
 
 @dataclass(frozen=True, eq=False)
-class Shifted:
+class CorrectedState:
     """A state that is shifted: its slopes are its own.
 
     Args:
@@ -117,14 +119,14 @@ class Shifted:
         return None
 
     @property
-    def extent(self) -> float | None:
-        """How far the load lies out: see `State.extent`."""
-        return self.own.extent
+    def extrapolation_ratio(self) -> float | None:
+        """How far the load lies out: see `State.extrapolation_ratio`."""
+        return self.own.extrapolation_ratio
 
-    def push(self, changes: ArrayLike) -> Floats:
+    def jvp(self, changes: ArrayLike) -> Floats:
         """As the fast model has it."""
-        return self.own.push(changes)
+        return self.own.jvp(changes)
 
-    def pull(self, cotangent: ArrayLike) -> Floats:
+    def vjp(self, cotangent: ArrayLike) -> Floats:
         """As the fast model has it."""
-        return self.own.pull(cotangent)
+        return self.own.vjp(cotangent)
