@@ -307,7 +307,7 @@ def describe_estimate(estimate: Mapping[str, Any]) -> str:
     if unit == "m":
         value, low, high, unit = 1e3 * value, 1e3 * low, 1e3 * high, "mm"
     text = f"{estimate['name']} {_plain(value)}{' ' + unit if unit else ''} ({_plain(low)} to {_plain(high)})"
-    return text if estimate["told"] > _TOLD else f"{text}, not told by the cloud"
+    return text if estimate["variance_reduction"] > _TOLD else f"{text}, not told by the cloud"
 
 
 def _plain(value: float) -> str:

@@ -108,7 +108,7 @@ def of_unknowns(estimates: Sequence[Estimate], true: dict[str, float]) -> dict[s
     for estimate in estimates:
         value, (low, high) = true[estimate.name], estimate.interval
         off = abs(estimate.value - value) / (value if estimate.unit == "Pa" else 1.0)
-        found[estimate.name] = {"off": off, "within": float(low <= value <= high), "told": estimate.told}
+        found[estimate.name] = {"off": off, "within": float(low <= value <= high), "told": estimate.variance_reduction}
     return found
 
 

@@ -195,13 +195,13 @@ def _difference(
     body, known = data.body, samples.displacements[place]
     forces = np.zeros_like(body.points)
     forces[data.response.loaded] = samples.forces[place]
-    shift = ensemble.attachment * rng.standard_normal(3) if ensemble.attachment else np.zeros(3)
+    translation = ensemble.attachment * rng.standard_normal(3) if ensemble.attachment else np.zeros(3)
     carrier = None
     if others:
         body, carrier = others[int(rng.integers(len(others)))]
         forces = np.asarray(carrier.matrix.T @ forces)
     if ensemble.attachment or carrier is not None:
-        held = shifted(data.body, shift, body)
+        held = shifted(data.body, translation, body)
         if len(held) < _LEAST_HELD:
             return None
         if carrier is None and ensemble.poisson_ratio is None and np.array_equal(held, body.fixed):
@@ -220,14 +220,14 @@ def _difference(
     return None if np.linalg.norm(off, axis=1).max() > _TOO_FAR * size else np.asarray(off.ravel() / size)
 
 
-def shifted(body: Body, shift: Floats, other: Body | None = None) -> Ints:
+def shifted(body: Body, translation: Floats, other: Body | None = None) -> Ints:
     """The nodes that hold a body, moved along its surface: numbers of the nodes that are held then.
 
     A node of the boundary is held where the one nearest to the place that it would come from is.
 
     Args:
         body: with fixed nodes.
-        shift: (3,), metres.
+        translation: (3,), metres.
         other: another mesh of the same organ, whose nodes are wanted; the body itself if not given.
 
     Raises:
@@ -238,7 +238,7 @@ def shifted(body: Body, shift: Floats, other: Body | None = None) -> Ints:
     if not is_held.any():
         raise ValueError("shifted.body: expected fixed nodes on the boundary, got none.")
     wanted = body if other is None else other
-    nearest = body.boundary_tree.query(wanted.points[wanted.boundary_nodes] - shift)[1]
+    nearest = body.boundary_tree.query(wanted.points[wanted.boundary_nodes] - translation)[1]
     return np.asarray(wanted.boundary_nodes[is_held[nearest]])
 
 

@@ -15,7 +15,7 @@ _NAMED = 0.3  # of the largest share: who has less is not what a combination is 
 
 
 def uninformed(
-    parameter_blocks: ParameterBlocks, names: Sequence[str], covariance: Floats, told: float
+    parameter_blocks: ParameterBlocks, names: Sequence[str], covariance: Floats, variance_reduction: float
 ) -> tuple[list[str], list[str]]:
     """Unknowns that a cloud does not tell, and combinations of others that it does not tell either.
 
@@ -27,17 +27,17 @@ def uninformed(
         parameter_blocks: the unknowns.
         names: one for each coefficient.
         covariance: of the coefficients after the cloud, (count, count).
-        told: least part of a direction's variance that a cloud must take away.
+        variance_reduction: least part of a direction's variance that a cloud must take away.
     """
     if not np.isfinite(covariance).all():
         return [], []
     values, vectors = np.linalg.eigh(covariance)
-    hidden = vectors[:, values > 1.0 - told]
+    hidden = vectors[:, values > 1.0 - variance_reduction]
     is_alone = (hidden**2).sum(axis=1) >= _ALONE
     rest = np.flatnonzero(~is_alone)
     values, vectors = np.linalg.eigh(covariance[np.ix_(rest, rest)])
     alone, combined = [names[place] for place in np.flatnonzero(is_alone)], list[str]()
-    for vector in vectors[:, values > 1.0 - told].T:
+    for vector in vectors[:, values > 1.0 - variance_reduction].T:
         direction = np.zeros(len(covariance))
         direction[rest] = vector
         grown, shrunk = _sides(names, parameter_blocks.shares(direction))

@@ -37,7 +37,7 @@ class Estimate:
         unit: of the values.
         value: median.
         interval: that holds it with 90 %.
-        told: part of its variance beforehand that the cloud has taken away, 0 to 1.
+        variance_reduction: part of its variance beforehand that the cloud has taken away, 0 to 1.
         deviations: how far it lies from what was expected.
     """
 
@@ -45,7 +45,7 @@ class Estimate:
     unit: str
     value: float
     interval: tuple[float, float]
-    told: float
+    variance_reduction: float
     deviations: float
 
 
@@ -509,5 +509,5 @@ def estimate(name: str, unit: str, at: Callable[[float], float], mean: float, va
         variance: of it.
     """
     reach = WITHIN_90 * np.sqrt(max(variance, 0.0))
-    told = float(np.clip(1.0 - variance, 0.0, 1.0))
-    return Estimate(name, unit, at(mean), (at(mean - reach), at(mean + reach)), told, float(abs(mean)))
+    variance_reduction = float(np.clip(1.0 - variance, 0.0, 1.0))
+    return Estimate(name, unit, at(mean), (at(mean - reach), at(mean + reach)), variance_reduction, float(abs(mean)))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .forward import ForwardModel, ReducedModel, reduce_model
 from .parameter_blocks import ParameterBlocks
-from .priors import LikelihoodInformed, NodalForces, told
+from .priors import LikelihoodInformed, NodalForces, likelihood_informed
 from .residuals import SurfaceDistance
 from .uncertainty import unseen_response
 
@@ -41,8 +41,8 @@ class Prepared:
         return cls(forces, reduce_model(model, observed.nodes, forces.basis, parameter_blocks))
 
     def informed(self, observed: SurfaceDistance, rule: LikelihoodInformed) -> Prepared:
-        """The directions that a cloud can tell: see `unknowns.told`."""
-        kept = told(self.model, observed, rule)
+        """The directions that a cloud can tell: see `unknowns.likelihood_informed`."""
+        kept = likelihood_informed(self.model, observed, rule)
         return Prepared(self.forces.combined(kept), self.model.combined(kept))
 
     def leading(self, count: int) -> Prepared:

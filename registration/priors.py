@@ -176,7 +176,7 @@ class LikelihoodInformed:
     maximum: int = 96
 
 
-def told(model: ReducedModel, observed: SurfaceDistance, rule: LikelihoodInformed) -> Floats:
+def likelihood_informed(model: ReducedModel, observed: SurfaceDistance, rule: LikelihoodInformed) -> Floats:
     """Orthonormal combinations of a force basis that a cloud can tell at rest, (k, kept), those told best first.
 
     They are the leading eigenvectors of the prior-whitened Gauss-Newton matrix at rest: the likelihood-informed

@@ -68,11 +68,11 @@ class Expectations:
         extrapolation_ratio: largest load relative to what the model has learned.
         informed: fewest directions that a cloud must tell, where so many are unknown.
         pose: largest move of the pose in deviations of its prior.
-        condition: the same of stiffness and other unknowns beside the forces.
+        parameter: the same of stiffness and other unknowns beside the forces.
         gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
         discrepancy_scale: how often as large as it was seen to be what the model gets wrong may be taken.
         correction: however large beside what was seen, so little of it harms nobody: of an observed node, metres.
-        told: least part of the variance of such an unknown, and of every combination of them, that a cloud must take
+        minimum_variance_reduction: least part of the variance of such an unknown, and of every combination of them, that a cloud must take
             away where all forces are known.
     """
 
@@ -83,10 +83,10 @@ class Expectations:
     extrapolation_ratio: float = 1.2
     informed: float = 2.0
     pose: float = 3.0
-    condition: float = 3.0
+    parameter: float = 3.0
     discrepancy_scale: float = 2.0
     correction: float = 0.0
-    told: float = 0.5
+    minimum_variance_reduction: float = 0.5
     gradient: float = np.inf
 
     @classmethod
@@ -327,7 +327,7 @@ def _of_the_conditions(problem: Problem, found: SolverResult, expected: Expectat
     for known in problem.parameter_blocks.estimates(
         found.evaluation.coefficients[part], found.posterior.covariance[part, part]
     ):
-        if known.deviations > expected.condition:
+        if known.deviations > expected.parameter:
             findings.append(
                 (Verdict.DOUBTFUL, f"{known.name} lies {known.deviations:.1f} deviations from where it was expected")
             )
@@ -342,7 +342,7 @@ def _of_what_is_untold(problem: Problem, found: SolverResult, expected: Expectat
     names = [known.name for known in parameter_blocks.estimates(found.evaluation.coefficients[part], covariance)]
     if parameter_blocks.has_regions:
         names = [f"{name} of the rest" if name == "Young's modulus" else name for name in names]
-    alone, combined = uninformed(parameter_blocks, names, covariance, expected.told)
+    alone, combined = uninformed(parameter_blocks, names, covariance, expected.minimum_variance_reduction)
     given = "what is given is what was expected beforehand"
     same = "other values that differ so would explain it as well"
     return [

@@ -59,7 +59,7 @@ def test_a_ratio_and_a_pose_are_found_beside_the_forces(small_quickstart: Path) 
     assert found.judgement.verdict is Verdict.ACCEPTED, found.judgement.reasons
     assert found.draft is not None and not found.draft.estimates  # the network knows of no ratio
     (ratio,) = found.estimates
-    assert ratio.interval[0] < 0.40 < ratio.interval[1] and ratio.told > 0.0
+    assert ratio.interval[0] < 0.40 < ratio.interval[1] and ratio.variance_reduction > 0.0
     in_camera = found.pose.apply(body.points + found.displacement) - true.apply(body.points + truth)
     assert np.linalg.norm(in_camera, axis=1).mean() < 2.0 * deviation < 2e-3
     assert score(found, load.sum(axis=0)) < chi2.ppf(0.999, 3)

@@ -253,7 +253,7 @@ def test_under_dead_forces_a_cloud_tells_forces_over_stiffness_alone(
         assert doubt[2] < 0.05 * abs(ratio[2])
         assert result.uncertainty.deviation.max() > 0.0
         (modulus,) = result.estimates
-        assert modulus.value == pytest.approx(6500.0, rel=1e-3) and modulus.told < 0.02
+        assert modulus.value == pytest.approx(6500.0, rel=1e-3) and modulus.variance_reduction < 0.02
         model.problem.close()
     assert found["badly"].net_force_deviation[2] > 0.25 * abs(found["badly"].net_force[2])
     assert found["well"].net_force_deviation[2] < 0.08 * abs(found["well"].net_force[2])
@@ -281,7 +281,7 @@ def test_stiffness_ratio_forces_and_pose_are_found_together(body: Body, solved, 
     found = registrar.register(true.apply(cloud_on(body, truth, 800, rng, 5e-4)))
     assert found.judgement.verdict is Verdict.ACCEPTED, found.judgement.reasons
     modulus, ratio = found.estimates
-    assert modulus.interval[0] < 6500.0 < modulus.interval[1] and modulus.told < 0.5
+    assert modulus.interval[0] < 6500.0 < modulus.interval[1] and modulus.variance_reduction < 0.5
     assert ratio.interval[0] < 0.42 < ratio.interval[1]
     over, doubt = found.force_over_modulus
     assert (np.abs(over - net / 6500.0) < 4.0 * doubt).all()
@@ -301,7 +301,7 @@ def test_what_a_cloud_does_not_tell_is_called_so(body: Body, solved, rng: np.ran
     assert found.judgement.verdict is Verdict.DOUBTFUL
     for reason, name in zip(found.judgement.reasons, ("Young's modulus", "Poisson's ratio"), strict=True):
         assert reason.startswith(f"the cloud does not tell {name} under this load")
-    assert all(estimate.told < 0.1 for estimate in found.estimates)
+    assert all(estimate.variance_reduction < 0.1 for estimate in found.estimates)
     registrar.model.problem.close()
 
 
