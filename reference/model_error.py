@@ -124,7 +124,7 @@ def differences(
                 shifted(data.body, np.zeros(3))
             if ensemble.meshes and data.body.cells.shape[1] != 4:
                 raise ValueError(
-                    "ModelErrorEnsemble.meshes: expected a body of linear tetrahedra, which are made anew, got cells of "
+                    "ModelErrorEnsemble.meshes: expected a body of linear tetrahedra, got cells of "
                     f"{data.body.cells.shape[1]} nodes."
                 )
             held.enter_context(writing(Path(path)))
@@ -136,7 +136,7 @@ def differences(
         found = on_first(comm, prepare)
         first = comm.bcast(None if found is None else found[:3], root=0)
         task = partial(difference_block, folder=first[1], ensemble=first[2], seed=seed)
-        share_out(task, first[0], found[3] if found else [], comm, "alternatives")
+        share_out(task, first[0], found[3] if found else [], comm, "ensemble")
         return None if found is None else _read(found[1], count)
 
 

@@ -134,13 +134,13 @@ def read_discrepancy(path: Path | str, body: Body) -> tuple[Discrepancy, dict[st
             found = Discrepancy(held["modes"], held["rest"], float(card["places"]))
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise DiscrepancyError(
-            f"{path} cannot be read ({error}); is it truncated? `softtwin doubt` makes it."
+            f"{path} cannot be read ({error}); is it truncated? `softtwin model-error` makes it."
         ) from error
     if card.get("format") != _FORMAT:
         raise DiscrepancyError(f"{path}: expected format {_FORMAT}, got {card.get('format')}.")
     if card.get("body") != body.fingerprint:
         raise DiscrepancyError(
             f"{path} belongs to another body (fingerprint {str(card.get('body'))[:12]}..., got "
-            f"{body.fingerprint[:12]}...); make it again with `softtwin doubt`."
+            f"{body.fingerprint[:12]}...); make it again with `softtwin model-error`."
         )
     return found, card["made_of"]

@@ -366,6 +366,19 @@ def test_a_checkpoint_of_another_architecture_is_refused(data: DataSet, short: T
         train(data, replace(short, architecture=Perceptron()), tmp_path)
 
 
+def test_a_checkpoint_goes_on_whose_weights_have_their_earlier_name(
+    data: DataSet, short: TrainingPlan, tmp_path: Path
+) -> None:
+    """The objective was called lesson."""
+    whole = train(data, short, tmp_path)
+    checkpoint = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    weights = checkpoint["state_dict"]
+    assert weights and all(name.startswith("objective.") for name in weights)
+    checkpoint["state_dict"] = {name.replace("objective.", "lesson.", 1): value for name, value in weights.items()}
+    torch.save(checkpoint, tmp_path / CHECKPOINT)
+    assert _same(train(data, short, tmp_path), whole)
+
+
 @pytest.mark.parametrize("version", [1, VERSION + 1])
 def test_a_checkpoint_of_another_version_is_refused(
     data: DataSet, short: TrainingPlan, tmp_path: Path, version: int
