@@ -60,7 +60,7 @@ class Cantilever:
         if size > self.refuse_above:
             raise NotConverged("too large a step for the test model")
         extent = None if self.learned is None else size / self.learned
-        return CantileverState(self._shape, mean, 0.2, extent=extent)
+        return CantileverState(self._shape, mean, 0.2, extrapolation_ratio=extent)
 
 
 def seen_from_above(cells: tuple[int, int, int] = (8, 3, 3)) -> Body:
