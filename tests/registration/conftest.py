@@ -22,7 +22,7 @@ class CantileverState:
     mean: np.ndarray
     reach: float
     negative_pivots: int | None = None
-    extent: float | None = None
+    extrapolation_ratio: float | None = None
 
     @property
     def displacement(self) -> np.ndarray:
@@ -59,8 +59,8 @@ class Cantilever:
         size = float(np.abs(mean).max())
         if size > self.refuse_above:
             raise NotConverged("too large a step for the test model")
-        extent = None if self.learned is None else size / self.learned
-        return CantileverState(self._shape, mean, 0.2, extrapolation_ratio=extent)
+        extrapolation_ratio = None if self.learned is None else size / self.learned
+        return CantileverState(self._shape, mean, 0.2, extrapolation_ratio=extrapolation_ratio)
 
 
 def seen_from_above(cells: tuple[int, int, int] = (8, 3, 3)) -> Body:
