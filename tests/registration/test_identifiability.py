@@ -31,7 +31,7 @@ class TwoSprings:
     parts: tuple[float, float]
     moduli: np.ndarray
     negative_pivots: int | None = None
-    extent: float | None = None
+    extrapolation_ratio: float | None = None
 
     @property
     def displacement(self) -> np.ndarray:
