@@ -152,9 +152,9 @@ def _keys(schema: dict[str, Any], path: str = "") -> Iterator[tuple[str, str]]:
 
 
 def test_no_key_of_the_configuration_has_a_retired_word() -> None:
-    from softtwin.app.config import Configuration
+    from softtwin.app.config import Config
 
-    names = list(_keys(Configuration.model_json_schema()))
+    names = list(_keys(Config.model_json_schema()))
     assert len(names) > 30
     assert not (found := offending_names(names)), "\n".join(["", *found])
 

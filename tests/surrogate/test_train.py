@@ -367,16 +367,19 @@ def test_a_checkpoint_of_another_architecture_is_refused(data: DataSet, short: T
 
 
 def test_a_checkpoint_goes_on_whose_weights_have_their_earlier_name(
-    data: DataSet, short: TrainingPlan, tmp_path: Path
+    data: DataSet, short: TrainingPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The objective was called lesson."""
-    whole = train(data, short, tmp_path)
+    with monkeypatch.context() as patch:
+        _stop_in_round(patch, 3, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        with pytest.raises(SystemExit):
+            train(data, short, tmp_path)
     checkpoint = torch.load(tmp_path / CHECKPOINT, weights_only=True)
     weights = checkpoint["state_dict"]
     assert weights and all(name.startswith("objective.") for name in weights)
     checkpoint["state_dict"] = {name.replace("objective.", "lesson.", 1): value for name, value in weights.items()}
     torch.save(checkpoint, tmp_path / CHECKPOINT)
-    assert _same(train(data, short, tmp_path), whole)
+    assert _same(train(data, short, tmp_path), train(data, short))
 
 
 @pytest.mark.parametrize("version", [1, VERSION + 1])
