@@ -49,9 +49,9 @@ class LandmarkPairs:
         given = np.asarray(points, dtype=np.float64), np.asarray(places, dtype=np.float64)
         for name, values in zip(("points", "places"), given, strict=True):
             if values.ndim != 2 or values.shape[1] != 3 or not len(values) or len(values) != len(given[0]):
-                raise ValueError(f"Marks.{name}: expected shape (l, 3), as many of both, got {values.shape}.")
+                raise ValueError(f"LandmarkPairs.{name}: expected shape (l, 3), as many of both, got {values.shape}.")
             if not np.isfinite(values).all():
-                raise ValueError(f"Marks.{name}: expected finite numbers, got NaN or infinity.")
+                raise ValueError(f"LandmarkPairs.{name}: expected finite numbers, got NaN or infinity.")
         if not 0.0 < deviation < np.inf:
             raise ValueError(f"LandmarkPairs.deviation: expected a positive number of metres, got {deviation}.")
         closest_points = observed.match(np.zeros((len(observed.nodes), 3)), given[0])

@@ -21,7 +21,7 @@ class SpringState:
     displacement: np.ndarray
     inverse: np.ndarray
     negative_pivots: int | None = 0
-    extent: float | None = None
+    extrapolation_ratio: float | None = None
 
     def jvp(self, changes: ArrayLike) -> np.ndarray:
         moved = np.asarray(changes).reshape(len(self.inverse), -1)
