@@ -555,8 +555,8 @@ def _options(section: RegistrationSection, suited: RegistrationOptions) -> Regis
     if section.max_iterations:
         solver = replace(solver, max_iterations=section.max_iterations)
     localisation = suited.localisation
-    if section.reweighting_rounds >= 0:
-        localisation = replace(localisation, rounds=section.reweighting_rounds)
+    if section.rounds >= 0:
+        localisation = replace(localisation, rounds=section.rounds)
     return replace(
         suited,
         noise=noise,

@@ -218,7 +218,7 @@ def _field(direction: Direction, body: Body, nodes: Floats, vectors: Floats, spa
     low, high = nodes.min(axis=0) - (_RIM + 1) * edge, nodes.max(axis=0) + (_RIM + 1) * edge
     if not 0.0 < edge < np.inf or (high - low).max() / edge > MAXIMUM_VOXELS:
         raise ValueError(
-            f"spacing: expected an edge in metres of at least {(high - low).max() / MAXIMUM_VOXELS:.2g}, got {spacing:g}: "
+            f"spacing: expected an edge of at least {(high - low).max() / MAXIMUM_VOXELS:.2g} m, got {spacing:g}: "
             f"more than {MAXIMUM_VOXELS} voxels along a side."
         )
     counts = np.ceil((high - low) / edge).astype(int) + 1

@@ -124,7 +124,7 @@ def differences(
                 shifted(data.body, np.zeros(3))
             if ensemble.meshes and data.body.cells.shape[1] != 4:
                 raise ValueError(
-                    "ModelErrorEnsemble.meshes: expected a body of linear tetrahedra, which are made anew, got cells of "
+                    "ModelErrorEnsemble.meshes: expected a body of linear tetrahedra, got cells of "
                     f"{data.body.cells.shape[1]} nodes."
                 )
             held.enter_context(writing(Path(path)))
@@ -136,7 +136,7 @@ def differences(
         found = on_first(comm, prepare)
         first = comm.bcast(None if found is None else found[:3], root=0)
         task = partial(difference_block, folder=first[1], ensemble=first[2], seed=seed)
-        share_out(task, first[0], found[3] if found else [], comm, "alternatives")
+        share_out(task, first[0], found[3] if found else [], comm, "ensemble")
         return None if found is None else _read(found[1], count)
 
 
@@ -210,10 +210,6 @@ def _difference(
         forces[held] = 0.0
     if ensemble.poisson_ratio is not None:
         plan = replace(plan, poisson_ratio=float(rng.uniform(*ensemble.poisson_ratio)))
-    guess = None  # the model's own state is near: it halves the time, and the equilibrium is the same to 1e-10
-    if carrier is None:
-        guess = known.copy()
-        guess[body.fixed] = 0.0
     try:
         with Problem(body, plan.build_material(), plan.newton) as problem:
             found = problem.solve(forces, guess, stability=False).displacement

@@ -251,7 +251,7 @@ def reduce_model(
         return _PickedModel(model, nodes, basis, parameter_blocks)
     if parameter_blocks is not None:
         raise ValueError(
-            "parameter_blocks: expected a model that takes other parameters and prescribed displacements (the reference, or "
+            "parameter_blocks: expected a model that takes parameters and prescribed displacements (the reference, or "
             f"hybrid), got a {type(model).__name__}, which has learned one material and one support."
         )
     found: ReducedModel = model.reduced(nodes, basis)

@@ -461,7 +461,7 @@ class LocalModel:
         return find_correlated(linear, problem.noise, problem.forces.scale, worth)
 
     def inflation_factor(self) -> float:
-        """How many points tell what one would that errs by itself, as the residuals here have it; see `variance_inflation`."""
+        """How many correlated residuals count as one independent residual; see `variance_inflation`."""
         scaled = self.problem.residuals(self.evaluation, self.own) / self.deviations
         return variance_inflation(self.problem.observed.closest_points(self.evaluation.match), scaled, self.weights)
 

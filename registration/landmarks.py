@@ -1,4 +1,4 @@
-"""Landmarks that pull: points of the organ's surface whose places were found in the camera's picture."""
+"""Landmarks: points of the organ's surface whose positions were measured in the camera's frame."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class LandmarkPairs:
         far = np.abs(closest_points.distances)
         if far.max() > _REACH * observed.body.size:
             raise ValueError(
-                f"LandmarkPairs.points: expected points on the observed side at rest; point {int(far.argmax())} lies "
+                f"LandmarkPairs.points: expected points on the observed surface; point {int(far.argmax())} lies "
                 f"{1e3 * far.max():.0f} mm from it (in metres, and in the body's coordinates?)."
             )
         return cls(closest_points, given[1], deviation)

@@ -328,7 +328,7 @@ class ParameterBlocks:
             ratios = np.asarray(self.parameters["poisson_ratio"])
             if not ((ratios > LOWEST_RATIO) & (ratios < HIGHEST_RATIO)).all():
                 raise ValueError(
-                    f"ParameterBlocks.parameters: expected a Poisson's ratio within ]{LOWEST_RATIO}, {HIGHEST_RATIO}[ where "
+                    f"ParameterBlocks.parameters: expected Poisson's ratio in ]{LOWEST_RATIO}, {HIGHEST_RATIO}[ where "
                     f"it is unknown, got {ratios.min():g} to {ratios.max():g}."
                 )
         if isinstance(unknown, PrescribedMotion) and unknown.name not in self.body.node_sets:
@@ -340,7 +340,7 @@ class ParameterBlocks:
         moduli = np.asarray(self.parameters["young_modulus"])
         if moduli.min() <= MINIMUM_MODULUS:
             raise ValueError(
-                f"ParameterBlocks.parameters: expected a Young's modulus above {MINIMUM_MODULUS:g} Pa where it is unknown, "
+                f"ParameterBlocks.parameters: expected a Young's modulus above {MINIMUM_MODULUS:g} Pa to estimate it, "
                 f"got {moduli.min():g} Pa."
             )
         if unknown.cells is None:

@@ -63,7 +63,7 @@ class Problem:
         error: what the model may get wrong; None where it is not known in patterns.
         parameter_blocks: unknowns beside the forces, which the model takes; None where there are none.
         landmarks: landmarks that pull beside the cloud; None where there are none.
-        tangent_basis: two unit vectors across each point's measured normal, in the cloud's coordinates, (p, 2, 3): how far the
+        tangent_basis: two unit vectors across each point's measured normal, in the cloud's axes, (p, 2, 3): how far the
             surface leans towards them pulls, too; None for a cloud without normals.
         normal_deviation: standard deviation of that, radians.
         correlated: noise that neighbouring points share, as unknowns; None where each point errs by itself.

@@ -247,7 +247,7 @@ class Registrar:
 
         Forces have explained such noise as far as they can: only where it is left to itself it is seen as it is, so
         that a guess is good enough for a second try, and that one decides. What is shared over less than the edges of
-        the surface is the mesh's own, or noise that no force can follow: for that points are counted (`inflation_factor`). What
+        the surface is the mesh's own, or noise that no force can follow: the `inflation_factor` reckons with that. What
         would be larger than any noise, and leaves the search without an end, is none: nothing here explains it.
         """
         if not self.options.correlated or found.problem.correlated is not None or found.local is None:
@@ -288,7 +288,7 @@ class Registrar:
     ) -> Registration:
         """What this model makes of a cloud, from what a faster model of the same body has found for it.
 
-        Most of the way is the faster model's, moved to this one's states (see `ManifoldMapping`); the end is this one's.
+        Most of the way is the faster model's, corrected by this one's (`ManifoldMapping`); the end is this one's.
 
         Args:
             cloud: observed points, (p, 3), metres.

@@ -34,8 +34,8 @@ class Registration:
         state: the body's state as the model has it, with its derivatives.
         correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres; with
             it what a pose that was said to be known is off by.
-        discrepancy_scale: how large the model's error was found, in units of its samples'; 1 where it is not known in patterns.
-        inflation_factor: so many points tell what one would that errs by itself; 1 where each does.
+        discrepancy_scale: factor found of the discrepancy's prior standard deviation; 1 where none is known.
+        inflation_factor: how many correlated residuals count as one; 1 where all are independent.
         pose: from the body's coordinates to the cloud's.
         pose_correction: what a pose that was said to be known is off by: a motion in the body's coordinates.
         net_force: (3,), newtons.
@@ -44,7 +44,7 @@ class Registration:
         force_scale: standard deviation of the force coefficients that was found, newtons.
         rms_distance: of the cloud to the registered surface, metres.
         outliers: share of the points that pulled nothing.
-        informed: directions of force and pose that the cloud told.
+        informed: number of likelihood-informed directions of force and pose.
         points: points that were used, after thinning.
         outcome: how the solver ended.
         judgement: whether the result can be used, and why not.

@@ -72,7 +72,8 @@ class Expectations:
         gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
         discrepancy_scale: how often as large as it was seen to be what the model gets wrong may be taken.
         correction: however large beside what was seen, so little of it harms nobody: of an observed node, metres.
-        minimum_variance_reduction: least part of the variance of such an unknown, and of every combination of them, that a cloud must take
+        minimum_variance_reduction: part of the variance of such a parameter, and of every combination of them, that a
+            cloud must take
             away where all forces are known.
     """
 
@@ -209,7 +210,7 @@ def shared(closest_points: Floats, distances: Floats, weights: Floats) -> float:
     """Part of the variance of the distances that a point shares with its neighbours, between 0 and 1.
 
     Args:
-        closest_points: places of the points on the surface at rest, (p, 3), metres; in space, noise sorts points by sign.
+        closest_points: on the undeformed surface, (p, 3), metres; in space, noise sorts points by sign.
         distances: signed, (p,), metres.
         weights: of the points, (p,); those without weight are left out.
     """

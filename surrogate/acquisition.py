@@ -20,7 +20,7 @@ _LEAST_SPREAD = 1e-3  # of the largest: a direction hardly ever loaded must not 
 def most_informative(surrogate: Surrogate, candidates: Iterable[Floats], wanted: int, known: Floats) -> Ints:
     """Places of the candidates that tell a network most.
 
-    Of the loads whose predictions have the longest linear step to balance (`ErrorIndicators.step`; one that is inside out counts
+    Of the loads whose predictions have the longest linear step to balance (`ErrorIndicators.step`; inverted ones count
     as infinitely far) those are taken that lie far from what is known and from each other in the network's
     coordinates (farthest-point sampling, Gonzalez 1985). Every second one is the next candidate as they come, so that
     what is learned keeps to how loads are drawn.

@@ -18,7 +18,7 @@ _LEAST_REST = 1e-3  # of the mean square of a component
 
 
 def with_domain(surrogate: Surrogate, data: DataSet) -> Surrogate:
-    """The surrogate with the extent of its training loads: `SurrogateState.extrapolation_ratio` is 1 at the farthest of them.
+    """The surrogate with the range of its training loads: the extrapolation ratio is 1 at the farthest of them.
 
     The measure is the root mean square of the network's coordinates, each in units of its spread over training. What
     the coordinates do not see is told by how the loads spread over the nodes (`LinearEncoderDecoder.load_modes`).

@@ -57,7 +57,7 @@ class ErrorEstimator:
         known = surrogate.card.get("certificate")
         if not known:
             raise CalibrationError(
-                "ErrorEstimator.surrogate: expected a twin that was calibrated, got one without a certificate in its card; "
+                "ErrorEstimator.surrogate: expected a twin that was calibrated, got one without bounds in its card; "
                 "give it calibration samples (samples.calibration) and train it again."
             )
         self._known: dict[str, Any] = dict(known)
@@ -96,7 +96,7 @@ class ErrorEstimator:
         known = self._known if indicators.newton is None else self._known.get("newton")
         if not known:
             raise CalibrationError(
-                "ErrorEstimator.newton: expected a twin whose steps of Newton's method were calibrated, got none in its "
+                "ErrorEstimator.newton: expected a twin whose Newton steps were calibrated, got none in its "
                 "card; calibrate it anew, with `stepped` at what is needed or more."
             )
         bounds = {error: bound(known, indicators, error) for error in ERRORS}
@@ -109,7 +109,7 @@ class ErrorEstimator:
             found.append("the prediction turns a cell inside out or has no balance to speak of")
         if indicators.unseen:
             found.append(
-                f"it acts on {indicators.unseen} nodes that never carried load in training: the prediction leaves that out"
+                f"it acts on {indicators.unseen} nodes that carried no load in training: the prediction leaves that out"
             )
         if indicators.distance is not None and indicators.distance > 1.0:
             found.append(f"the load lies {indicators.distance:.2g} times as far out as the farthest of the training")

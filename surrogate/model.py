@@ -70,7 +70,7 @@ class SurrogateState:
 
     @property
     def is_inside(self) -> bool | None:
-        """Whether the load lies among those that were learned (`extrapolation_ratio` is 1 at most); None where nobody knows."""
+        """Whether the extrapolation ratio is 1 at most, within the training loads; None where it is not known."""
         extrapolation_ratio = self.extrapolation_ratio
         return None if extrapolation_ratio is None else extrapolation_ratio <= 1.0
 
@@ -273,8 +273,8 @@ class Surrogate:
         bad = self._idle[sizes[self._idle] > 0.0]
         if len(bad):
             raise ValueError(
-                f"Surrogate.{name}: expected forces at the {len(self.encoder_decoder.loaded)} nodes that carried load in "
-                f"training (surrogate.encoder_decoder.loaded), got some at {len(bad)} other nodes, first {bad[:5].tolist()}."
+                f"Surrogate.{name}: expected forces at the {len(self.encoder_decoder.loaded)} nodes loaded in "
+                f"training (surrogate.encoder_decoder.loaded), got {len(bad)} others, first {bad[:5].tolist()}."
             )
 
 

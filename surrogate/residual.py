@@ -29,7 +29,7 @@ class ElasticBody(nn.Module):
         body: the body, in space.
         material: strain energy; not mixed, and not an own `Energy`, which is written in UFL.
         weights: factor of each cell's energy, (cells,), in place of the body's own fractions.
-        minimum_jacobian: for training: det F below it counts for more (`TorchAlgebra`), and nothing is NaN; 0 leaves all
+        minimum_jacobian: for training: det F below it counts more (`TorchAlgebra`), and nothing is NaN; 0 leaves all
             as it is.
 
     Raises:

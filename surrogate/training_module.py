@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import signal
 import threading
 import time
@@ -250,7 +251,9 @@ class TrainingModule(lightning.LightningModule):
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take it back."""
+        """Take it back; weights of a training begun under an earlier name are read, too."""
+        weights = checkpoint["state_dict"]
+        checkpoint["state_dict"] = {re.sub(r"^lesson\.", "objective.", name): value for name, value in weights.items()}
         self.take_back(checkpoint["course"])
 
     def take_back(self, training_module: dict[str, Any]) -> None:

@@ -62,7 +62,8 @@ def test_forces_grow_with_the_bodys_stiffness_alone(body: Body, rng: np.random.G
     parameter_blocks, step = everything(body), 1e-6
     at = 0.5 * rng.standard_normal(parameter_blocks.count)
     stiffness_scaling, slopes = parameter_blocks.stiffness_scaling(at)
-    differences = [(parameter_blocks.stiffness_scaling(at + e)[0] - parameter_blocks.stiffness_scaling(at - e)[0]) / (2.0 * step)
+    scaling = parameter_blocks.stiffness_scaling
+    differences = [(scaling(at + e)[0] - scaling(at - e)[0]) / (2.0 * step)
                    for e in step * np.eye(len(at))]  # fmt: skip
     np.testing.assert_allclose(slopes, differences, atol=1e-8)
     assert (

@@ -124,7 +124,7 @@ def test_none_change_nothing(body: Body) -> None:
         ({"places": np.zeros((3, 3))}, r"LandmarkPairs.places: expected shape \(l, 3\), as many of both"),
         ({"places": np.full((2, 3), np.nan)}, "LandmarkPairs.places: expected finite numbers"),
         ({"deviation": 0.0}, "LandmarkPairs.deviation: expected a positive number"),
-        ({"points": np.full((2, 3), 9.0)}, "expected points on the observed side at rest; point 0 lies"),
+        ({"points": np.full((2, 3), 9.0)}, "expected points on the observed surface; point 0 lies"),
     ],
 )
 def test_what_are_no_landmarks_is_refused(body: Body, change: dict[str, object], words: str) -> None:

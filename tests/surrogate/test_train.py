@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from softtwin.reference.data.dataset import DataSet, DataSetError
-from softtwin.reference.data.writing import drop_block
+from softtwin.reference.data.dataset import DataSet, DataSetError, drop_block
 from softtwin.surrogate import training_module as training
 from softtwin.surrogate.architecture import Architecture
 from softtwin.surrogate.checkpoint import CHECKPOINT, VERSION, CheckpointError
@@ -365,6 +364,22 @@ def test_a_checkpoint_of_another_architecture_is_refused(data: DataSet, short: T
     train(data, short, tmp_path)
     with pytest.raises(CheckpointError, match=r"another plan \(differs in architecture, "):
         train(data, replace(short, architecture=Perceptron()), tmp_path)
+
+
+def test_a_checkpoint_goes_on_whose_weights_have_their_earlier_name(
+    data: DataSet, short: TrainingPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The objective was called lesson."""
+    with monkeypatch.context() as patch:
+        _stop_in_round(patch, 3, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        with pytest.raises(SystemExit):
+            train(data, short, tmp_path)
+    checkpoint = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    weights = checkpoint["state_dict"]
+    assert weights and all(name.startswith("objective.") for name in weights)
+    checkpoint["state_dict"] = {name.replace("objective.", "lesson.", 1): value for name, value in weights.items()}
+    torch.save(checkpoint, tmp_path / CHECKPOINT)
+    assert _same(train(data, short, tmp_path), train(data, short))
 
 
 @pytest.mark.parametrize("version", [1, VERSION + 1])
