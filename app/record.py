@@ -167,7 +167,7 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "net_force_covariance_N2": (turned @ result.net_force_covariance @ turned).tolist(),
         "force_scale_N": result.force_scale,
         "largest_displacement_m": float(np.linalg.norm(result.displacement, axis=1).max()),
-        "model_doubt": result.discrepancy_scale,
+        "discrepancy_scale": result.discrepancy_scale,
         "largest_correction_m": float(np.linalg.norm(result.correction, axis=1).max()),
         "pose": twin.coordinates.motion(result.pose.matrix).tolist(),
         "points": result.points,

@@ -450,7 +450,7 @@ class Twin:
             return None
         material = self.config.material
         try:
-            return Scenario.of(self.config).parameter_blocks(self.body, material.young_modulus, material.poisson_ratio)
+            return Scenario.of(self.config).conditions(self.body, material.young_modulus, material.poisson_ratio)
         except ValueError as error:
             raise ConfigError(f"registration.parameters: {error}") from None
 
@@ -555,8 +555,8 @@ def _options(section: RegistrationSection, suited: RegistrationOptions) -> Regis
     if section.max_iterations:
         solver = replace(solver, max_iterations=section.max_iterations)
     localisation = suited.localisation
-    if section.rounds >= 0:
-        localisation = replace(localisation, rounds=section.rounds)
+    if section.reweighting_rounds >= 0:
+        localisation = replace(localisation, rounds=section.reweighting_rounds)
     return replace(
         suited,
         noise=noise,

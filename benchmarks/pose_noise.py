@@ -29,6 +29,8 @@ from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.pose import Pose
 from softtwin.registration.priors import PosePrior
+from softtwin.registration.registrar import Registrar
+from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
 SEQUENCE, FRAME = "s3", 25  # the thesis does not say which frame of which of its five

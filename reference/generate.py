@@ -40,6 +40,7 @@ from .data.outcome import Equilibrium, NotConverged
 from .data.samplers import LoadPlan, QuasiRandom, check_loads, draw_load, loaded_nodes, sobol_point
 from .data.schema import Reason
 from .data.shard import Shard, at_work_on, refuse_shards_at_work
+from .data.writing import create, drop_block, write_block
 from .farm import Task, quiet, share_out
 from .fem.fenicsx import MPI, PETSc, dolfinx
 from .modes import eigenmodes

@@ -89,9 +89,10 @@ def leading_directions(surrogate: Surrogate, count: int, device: str = "cpu") ->
     """
     if count < 1:
         raise ValueError(f"leading_directions.count: expected at least 1, got {count}.")
-    every = np.zeros((surrogate.body.points.size, len(surrogate.rows)))
-    every[surrogate.rows, np.arange(len(surrogate.rows))] = 1.0
-    whole = surrogate.solve(np.zeros_like(surrogate.body.points)).jvp(every)
+    inputs, kind = 3 * len(surrogate.encoder_decoder.loaded), torch.float64 if device == "cpu" else torch.float32
+    module = Linearised(surrogate, np.eye(inputs), kind).to(device).eval().requires_grad_(False)
+    with torch.no_grad(), without_tf32():
+        whole = module(torch.zeros(inputs, dtype=kind, device=device))[1].cpu().double().numpy()
     return np.ascontiguousarray(np.linalg.svd(whole, full_matrices=False)[2][:count].T)
 
 

@@ -19,10 +19,7 @@ from softtwin.surrogate.error_indicators import CalibrationError
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import Device, TrainingPlan
-from softtwin.surrogate.reduced import Reduced
-from softtwin.surrogate.registry import ARCHITECTURES
 from softtwin.surrogate.train import train
-from softtwin.surrogate.training_module import chosen_device
 from softtwin.surrogate.twin import load, save
 
 from ..config import ConfigError, to_toml

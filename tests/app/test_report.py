@@ -26,7 +26,8 @@ from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.data.dataset import LinearResponse, create, write_block
+from softtwin.reference.data.dataset import LinearResponse
+from softtwin.reference.data.writing import create, write_block
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.parameter_blocks import Estimate
 from softtwin.registration.pose import Pose

@@ -21,10 +21,10 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
-from softtwin.reference.data import dataset
-from softtwin.reference.data.dataset import SPLITS, DataSet, DataSetError, Split, drop_block, probe_cotangents
+from softtwin.reference.data.dataset import SPLITS, DataSet, DataSetError, Split, probe_cotangents
 from softtwin.reference.data.samplers import LoadPlan, QuasiRandom, sobol_point
 from softtwin.reference.data.shard import Shard, at_work_on
+from softtwin.reference.data.writing import drop_block, write_block
 from softtwin.reference.generate import DamagedBlock, Plan, generate, linear_response, solve_block
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 
