@@ -124,17 +124,17 @@ class Command(click.Command):
         """Write the options, those that most people need first, each under its group."""
         entries = [param for param in self.get_params(ctx) if isinstance(param, SchemaFlag)]
         for advanced in (False, True):
-            for heading, rows in _grouped(param for param in entries if param.entry.is_advanced is advanced):
+            for heading, params in _grouped(param for param in entries if param.entry.is_advanced is advanced):
                 with formatter.section(f"Advanced: {heading}" if advanced else heading.capitalize()):
-                    formatter.write_dl([row for param in rows if (row := param.get_help_record(ctx))])
+                    formatter.write_dl([record for param in params if (record := param.get_help_record(ctx))])
         others = [
             param
             for param in self.get_params(ctx)
             if isinstance(param, click.Option) and not isinstance(param, SchemaFlag)
         ]
-        if rows := [row for param in others if (row := param.get_help_record(ctx))]:
+        if records := [record for param in others if (record := param.get_help_record(ctx))]:
             with formatter.section("Other"):
-                formatter.write_dl(rows)
+                formatter.write_dl(records)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """The arguments read; a former flag is refused with the name that it has now."""

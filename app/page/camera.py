@@ -42,7 +42,7 @@ class View:
     shift: float = 0.0
 
     @property
-    def is_askew(self) -> bool:
+    def is_misaligned(self) -> bool:
         """Whether the camera's coordinates are not the body's, so that the pose is to be found."""
         return bool(self.turn or self.shift)
 

@@ -86,7 +86,7 @@ def test_a_camera_that_stands_elsewhere_than_was_said_is_told(told: list[Figures
     show(PHANTOM, [cloud], browser=False, say=lambda _: None)  # type: ignore[list-item]
     assert answered(told)[-1].askew is None
     show(PHANTOM, [cloud + np.array([0.0, 0.0, 8e-3])], browser=False, say=lambda _: None)  # type: ignore[list-item]
-    askew = answered(told)[-1].askew
+    pose_correction = answered(told)[-1].askew
     assert askew is not None and 2e-3 < askew[0] < 10e-3
 
 
@@ -125,7 +125,7 @@ def test_an_askew_camera_is_found(told: list[Figures]) -> None:
     with page_server.serving() as server:
         session = Session(server, find_twin(PHANTOM), is_simulated=True)
         session.controls._sliders[2].value, session.controls._sliders[3].value = 4.0, 5.0
-        assert session.wishes.view.is_askew
+        assert session.wishes.view.is_misaligned
         session.run(slowly(session, shots(2, view), told))
     found = answered(told)[-1]
     assert found.verdict is not Verdict.REFUSED
