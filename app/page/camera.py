@@ -1,4 +1,4 @@
-"""A simulated camera: clouds of an organ whose true states are known, as noisy, partial and askew as is asked."""
+"""A simulated camera: clouds of an organ whose true states are known, as noisy, partial and misaligned as is asked."""
 
 from __future__ import annotations
 

@@ -63,9 +63,9 @@ def test_the_camera_has_the_noise_the_share_and_the_pose_that_are_asked(body: Bo
     assert added.std() == pytest.approx(2e-3, rel=4 / np.sqrt(2 * added.size))  # four deviations of such an estimate
     assert len(plain.cloud) == POINTS and len(part.cloud) == round(0.3 * POINTS)
     view = View(0.0, turn=0.1, shift=5e-3)
-    pose_correction = seen(view)
+    misaligned = seen(view)
     assert view.is_misaligned and not View().is_misaligned
-    assert np.allclose(pose_of(view, body).inverse().apply(askew.cloud), plain.cloud, atol=1e-12)
+    assert np.allclose(pose_of(view, body).inverse().apply(misaligned.cloud), plain.cloud, atol=1e-12)
     assert pose_of(view, body).angle_to(pose_of(View(), body)) == pytest.approx(0.1)
 
 
