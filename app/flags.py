@@ -13,7 +13,7 @@ from .schema import ConfigError, Option, Section, options_of
 _ORDER = ("input", "pose", "noise", "forces", "parameters", "material", "equilibria", "training", "solver", "output")
 
 
-class SchemaType(click.ParamType):
+class SchemaType(click.ParamType):  # type: ignore[type-arg]  # generic in recent click alone
     """A value that the schema checks: the message has the flag, what is allowed, and what came.
 
     Args:

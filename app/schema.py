@@ -49,7 +49,14 @@ def option(
         repeated: whether a text is given in several flags, which ' + ' joins.
         bounds: `gt`, `ge`, `lt`, `le` of a number.
     """
-    more = {"unit": unit, "group": group, "basic": basic, "flag": flag, "metavar": metavar, "old": list(old)}
+    more: dict[str, Any] = {
+        "unit": unit,
+        "group": group,
+        "basic": basic,
+        "flag": flag,
+        "metavar": metavar,
+        "old": list(old),
+    }
     limits: dict[str, Any] = bounds
     return Field(
         default, description=meaning, json_schema_extra={**more, "exists": exists, "repeated": repeated}, **limits
@@ -231,7 +238,7 @@ class Option:
 def _adapter(option: Option) -> TypeAdapter[Any]:
     kind: Any = option.field.annotation
     limits = tuple(option.field.metadata)
-    held = Annotated[(kind, *limits)] if limits else kind  # type: ignore[valid-type]
+    held: Any = Annotated[(kind, *limits)] if limits else kind
     return TypeAdapter(held, config=ConfigDict(allow_inf_nan=False))
 
 

@@ -38,8 +38,8 @@ class Figures:
         dropped: clouds that came and were never registered, in all.
         rate: answers a second.
         engine: that registers.
-        pose_correction: translation in metres and rotation in radians between where the camera was said to stand and where
-            it is found to; None where the cloud shows none.
+        pose_correction: translation in metres and rotation in radians from where the camera was said to stand
+            to where it is found; None where the cloud shows none.
     """
 
     title: str

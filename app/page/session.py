@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from softtwin.registration.pose import Pose
 from softtwin.registration.result import Registration
 
-from ..record import askew_of
+from ..record import pose_correction_of
 from ..register import registered
 from ..streams import Arrival, Mailbox, fed
 from ..twin import Camera, Frame, Home, Sequence, Twin
@@ -191,7 +191,7 @@ class Session:
             return
         self._forces = found.forces
         margins, errors = margins_of(twin, found), errors_of(twin, found, shot.truth)
-        off = askew_of(found)
+        off = pose_correction_of(found)
         self._figures = replace(
             self._figures,
             verdict=judgement.verdict,
@@ -201,7 +201,7 @@ class Session:
             net_force=float(np.linalg.norm(found.net_force)),
             net_force_deviation=float(np.linalg.norm(found.net_force_deviation)),
             true_net_force=np.nan if shot.net_force is None else float(np.linalg.norm(shot.net_force)),
-            pose_correction=None if off is None or not off["is_seen"] else (off["shift_m"], off["turn_rad"]),
+            pose_correction=None if off is None or not off["is_seen"] else (off["translation_m"], off["rotation_rad"]),
         )
         self.brush.glide(found.displacement)
         self._paint(found, frame, shot, wishes, twin)
