@@ -339,7 +339,7 @@ def identify(
 ) -> None:
     """Find what TWIN is made of from CLOUDS under known loads: stiffness, Poisson's ratio, where a region has gone.
 
-    Each cloud is a state under the same loads, or of the same unknowns; what all of them say together stands at the
+    Each cloud is a state under the same loads, or of the same parameters; what all of them say together stands at the
     end, with the interval that holds it with 90 %. A parameter that they do not inform is called so. Ends with code 3
     where no cloud could be used. Where forces are unknown as well, use `softtwin register --parameter`.
     """

@@ -13,7 +13,7 @@ from .schema import ConfigError, Option, Section, options_of
 _ORDER = ("input", "pose", "noise", "forces", "parameters", "material", "equilibria", "training", "solver", "output")
 
 
-class SchemaType(click.ParamType[Any]):
+class SchemaType(click.ParamType):  # type: ignore[type-arg]  # generic in recent click alone
     """A value that the schema checks: the message has the flag, what is allowed, and what came.
 
     Args:
@@ -124,16 +124,15 @@ class Command(click.Command):
         """Write the options, those that most people need first, each under its group."""
         entries = [param for param in self.get_params(ctx) if isinstance(param, SchemaFlag)]
         for advanced in (False, True):
-            for heading, rows in _grouped(param for param in entries if param.entry.is_advanced is advanced):
+            for heading, params in _grouped(param for param in entries if param.entry.is_advanced is advanced):
                 with formatter.section(f"Advanced: {heading}" if advanced else heading.capitalize()):
-                    formatter.write_dl([row for param in rows if (row := param.get_help_record(ctx))])
+                    formatter.write_dl([record for param in params if (record := param.get_help_record(ctx))])
         others = [
             param
             for param in self.get_params(ctx)
             if isinstance(param, click.Option) and not isinstance(param, SchemaFlag)
         ]
-        records = [record for param in others if (record := param.get_help_record(ctx))]
-        if records:
+        if records := [record for param in others if (record := param.get_help_record(ctx))]:
             with formatter.section("Other"):
                 formatter.write_dl(records)
 

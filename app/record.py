@@ -178,9 +178,9 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "evaluations": result.evaluations,
         "solve_seconds": result.seconds,
     }
-    askew = askew_of(result)
-    if askew is not None:
-        row["askew"] = askew
+    correction = pose_correction_of(result)
+    if correction is not None:
+        row["pose_correction"] = correction
     shared = result.problem.correlated
     if shared is not None:
         row["shared_noise"] = {"size_m": shared.size, "length_m": shared.length}
@@ -224,14 +224,14 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
     return row
 
 
-def askew_of(result: Registration) -> dict[str, Any] | None:
+def pose_correction_of(result: Registration) -> dict[str, Any] | None:
     """What a pose that was said to be known is off by, SI units; None for one that is exact, or unknown altogether."""
     pose = result.problem.pose
     if pose is None or not pose.is_said:
         return None
     return {
-        "turn_rad": result.pose_correction.angle_to(Pose.identity()),
-        "shift_m": float(np.linalg.norm(result.pose_correction.apply(pose.centre) - pose.centre)),
+        "rotation_rad": result.pose_correction.angle_to(Pose.identity()),
+        "translation_m": float(np.linalg.norm(result.pose_correction.apply(pose.centre) - pose.centre)),
         "chance": result.chance_of_pose,
         "is_seen": result.chance_of_pose < _ASKEW,
     }
@@ -279,8 +279,11 @@ def describe(row: Mapping[str, Any]) -> str:
     if "shared_noise" in row:
         size, length = (row["shared_noise"][name] for name in ("size_m", "length_m"))
         line += f", of which neighbours within {millimetres(length, 0)} share noise of {millimetres(size)}"
-    if row.get("askew", {}).get("is_seen"):
-        shift, turn = millimetres(row["askew"]["shift_m"]), np.rad2deg(row["askew"]["turn_rad"])
+    if row.get("pose_correction", {}).get("is_seen"):
+        shift, turn = (
+            millimetres(row["pose_correction"]["translation_m"]),
+            np.rad2deg(row["pose_correction"]["rotation_rad"]),
+        )
         line += f", pose {shift} and {turn:.1f} degrees from where it was said"
     line += f", {row['landmarks']} landmarks" if "landmarks" in row else ""
     line += (

@@ -450,7 +450,7 @@ class Twin:
             return None
         material = self.config.material
         try:
-            return Scenario.of(self.config).conditions(self.body, material.young_modulus, material.poisson_ratio)
+            return Scenario.of(self.config).parameter_blocks(self.body, material.young_modulus, material.poisson_ratio)
         except ValueError as error:
             raise ConfigError(f"registration.parameters: {error}") from None
 

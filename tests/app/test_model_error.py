@@ -16,7 +16,7 @@ pytest.importorskip("torch", reason="torch is absent")
 
 from softtwin.app.config import ConfigError
 from softtwin.app.stages.model_error import is_current, model_error_stage
-from softtwin.app.twin import MODEL_ERROR, Twin, find_twin, forward_models
+from softtwin.app.twin import FORMER_MODEL_ERROR, MODEL_ERROR, Twin, find_twin, forward_models
 from softtwin.app.workspace import open_workspace
 from softtwin.meshes.files import read_body
 from softtwin.reference.data.dataset import DataSet
@@ -108,6 +108,18 @@ def test_the_record_and_the_report_say_so(quickstart: Path, capsys: pytest.Captu
     run(capsys, "report", quickstart)
     page = (quickstart / "report.html").read_text()
     assert "and for an attachment that lies elsewhere by some 4.0 mm along each axis; not for a wrong shape" in page
+
+
+def test_the_file_of_before_is_read(quickstart: Path) -> None:
+    """As a twin has it that was made when the ensemble's file and stage were called doubt."""
+    (quickstart / "twin" / MODEL_ERROR).rename(quickstart / "twin" / FORMER_MODEL_ERROR)
+    records = quickstart / "stages.json"
+    records.write_text(records.read_text().replace('"model_error', '"doubt'))
+    assert '"doubt"' in records.read_text() and '"doubt.draws"' in records.read_text()
+    space = open_workspace(quickstart / "organ.toml")
+    assert is_current(space, DataSet(space.data))
+    with Twin.open(quickstart) as twin:
+        assert twin.model_error["attachment"] == 0.004
 
 
 @pytest.mark.parametrize(

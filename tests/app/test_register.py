@@ -177,10 +177,10 @@ def test_a_start_is_an_unknown_unless_said_otherwise(plain_twin: Twin, wanted: s
 def test_a_camera_that_is_seen_to_stand_elsewhere_is_said(plain_twin: Twin, cloud, tmp_path: Path, off: float) -> None:
     lines: list[str] = []
     (row,) = register_clouds(plain_twin, [cloud + off * np.array([0.0, 0.6, 0.8])], tmp_path, say=lines.append)
-    assert row["askew"]["is_seen"] == (off > 0.0)
+    assert row["pose_correction"]["is_seen"] == (off > 0.0)
     assert ("degrees from where it was said" in lines[0]) == (off > 0.0)
     if off:
-        assert 0.2 * off < row["askew"]["shift_m"] < 2.0 * off
+        assert 0.2 * off < row["pose_correction"]["translation_m"] < 2.0 * off
 
 
 def test_every_frame_is_written_with_its_verdict(plain_twin: Twin, cloud, forces, tmp_path: Path) -> None:
