@@ -104,7 +104,7 @@ class Scenario:
         found[body.fixed] = 0.0
         return found
 
-    def conditions(self, body: Body, modulus: float, ratio: float) -> ParameterBlocks | None:
+    def parameter_blocks(self, body: Body, modulus: float, ratio: float) -> ParameterBlocks | None:
         """The parameters as registration takes them; None where there are none.
 
         Args:

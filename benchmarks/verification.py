@@ -1,4 +1,4 @@
-"""What the reference solver is checked against, at full size, written as docs/verification.md.
+"""What the reference solver is checked against, at full size, written as docs/archive/verification.md.
 
 python benchmarks/verification.py [--only closed patch manufactured tangent taylor cook locking]
 python benchmarks/verification.py page                  # the page alone, from the records
@@ -385,7 +385,7 @@ the finest mixed solution (Q2-Q1, {first["finest"]} cells across): {best}.
 P1 and Q1 lock, at 0.4999 beyond use; P2 and Q2 are slower than their mixed forms, which do not feel Poisson's ratio.
 
 {markdown(["", "element", *(f"{n} across" for n in first["divisions"])], rows)}
-![Deflection of each element by mesh](verification-locking.png)
+![Deflection of each element by mesh](../verification-locking.png)
 """
 
 
@@ -435,7 +435,7 @@ def pages() -> None:
     found = recorded("verification")
     draw_locking(found["locking"], DOCS / "verification-locking.png")
     sections = [INTRODUCTION, *(page(found[name]) for name, (_, page) in STUDIES.items()), *recorded_pages()]
-    (DOCS / "verification.md").write_text("\n".join(sections))
+    (DOCS / "archive" / "verification.md").write_text("\n".join(sections))
 
 
 BENCHMARK = Benchmark(

@@ -1,4 +1,4 @@
-"""Sections of docs/verification.md from the records of other benchmarks: other codes, the real liver, hard loads."""
+"""Sections of docs/archive/verification.md from other benchmarks' records: other codes, the real liver, hard loads."""
 
 from __future__ import annotations
 

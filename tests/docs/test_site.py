@@ -6,6 +6,7 @@ import contextlib
 import functools
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -14,11 +15,15 @@ from collections.abc import Iterator
 from html.parser import HTMLParser
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
 pytest.importorskip("mkdocs", reason="the extra docs is absent")
 pytest.importorskip("material", reason="the extra docs is absent")
+pytest.importorskip("latex2mathml", reason="the extra docs is absent")
+
+from mkdocs.exceptions import PluginError
 
 ROOT = Path(__file__).resolve().parents[2]
 LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "video": "src", "link": "href"}
@@ -64,6 +69,25 @@ def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
     assert [address for address in found if re.match(r"(\w+:)?//", address)] == []
     styles = "".join(path.read_text() for path in site.rglob("*.css"))
     assert styles and re.findall(r"url\(\s*[\"']?(?:https?:)?//|@import[^;]*//", styles) == []
+
+
+@pytest.mark.parametrize("name", ["equilibrium", "registration", "surrogates"])
+def test_equations_are_mathml_and_no_latex_is_left(site: Path, name: str) -> None:
+    page = (site / "method" / f"{name}.html").read_text()
+    equations = re.findall(r"<math .*?</math>", page, flags=re.S)
+    assert sum('display="block"' in equation for equation in equations) >= 8
+    assert all(ElementTree.fromstring(equation).tag.endswith("math") for equation in equations)
+    assert re.findall(r"arithmatex|\\[(\[]|\$\$", re.sub(r"<script.*?</script>", "", page, flags=re.S)) == []
+
+
+@pytest.mark.parametrize("formula", [r"\unheard{x}", r"x^", r"\left( x"])
+def test_latex_that_is_not_known_ends_the_build(formula: str) -> None:
+    with pytest.raises(PluginError, match=r"mathml"):
+        runpy.run_path(str(ROOT / "ci" / "mkdocs_math.py"))["mathml"](formula)
+
+
+def test_the_archive_is_not_in_the_site(site: Path) -> None:
+    assert not (site / "archive").exists() and list((ROOT / "docs" / "archive").glob("*.md"))
 
 
 def test_the_reference_has_what_the_docstrings_say(site: Path) -> None:
