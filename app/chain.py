@@ -14,13 +14,14 @@ from softtwin.surrogate.plan import Device
 
 from .config import Config, ConfigError, to_toml
 from .inputs import changes, load_plan, mesh_inputs, plan_entries, solved_data
-from .launch import doubt_in_parallel, generate_in_parallel
+from .launch import generate_in_parallel, model_error_in_parallel
 from .register import NOTICE
-from .stages.doubt import is_current
 from .stages.generate import describe_data, lacks_jacobians
-from .stages.learn import train_stage, training_plan, validate_stage
+from .stages.learn import train_stage, validate_stage
 from .stages.mesh import mesh_stage
-from .twin import DOUBT
+from .stages.model_error import is_current
+from .stages.plan import training_plan
+from .twin import FORMER_MODEL_ERROR, MODEL_ERROR
 from .workspace import Workspace, open_workspace, write_whole
 
 Say = Callable[[str], None]
@@ -102,8 +103,8 @@ def make_twin(
         train_stage(space, fresh=True, device=device, processes=processes)
     say("4/5 validate: held-out errors")
     say(validate_stage(space))
-    say("5/5 doubt: what the organ may be otherwise")
-    _doubt(space, path, say)
+    say("5/5 model error: perturbed models of the organ")
+    _model_error(space, path, say)
 
 
 def _mesh(space: Workspace, say: Say) -> Body:
@@ -131,14 +132,15 @@ def _generate(space: Workspace, body: Body, path: Path, say: Say, again: bool) -
     generate_in_parallel(path, space.config.samples.ranks, again)  # says itself what it has made
 
 
-def _doubt(space: Workspace, path: Path, say: Say) -> None:
-    if not space.config.doubt.is_asked_for:
-        (space.twin / DOUBT).unlink(missing_ok=True)
-        say("    nothing: [doubt] names none, and margins know of none")
+def _model_error(space: Workspace, path: Path, say: Say) -> None:
+    if not space.config.model_error.is_asked_for:
+        (space.twin / MODEL_ERROR).unlink(missing_ok=True)
+        (space.twin / FORMER_MODEL_ERROR).unlink(missing_ok=True)
+        say("    nothing: [model_error] perturbs nothing, and the margins do not cover the model's error")
     elif is_current(space, DataSet(space.data)):
         say("    as before")
     else:
-        doubt_in_parallel(path, space.config.samples.ranks)
+        model_error_in_parallel(path, space.config.samples.ranks)
 
 
 def _refuse_changes(space: Workspace, data: DataSet) -> None:

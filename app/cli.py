@@ -18,42 +18,47 @@ from softtwin.meshes.attachment import File, parse_file, parse_regions
 from softtwin.meshes.files import Axes, Unit, is_segmentation, stated_axes, stated_unit
 from softtwin.reference.ranks import FailedElsewhere
 
-from .config import LAWS, Config, ConfigError, parse_config, to_toml
+from .arguments import (
+    BuildArguments,
+    CloudArguments,
+    DemoArguments,
+    DrawArguments,
+    ExportArguments,
+    FreshArguments,
+    GenerateArguments,
+    IdentifyArguments,
+    PageArguments,
+    PickArguments,
+    QuickstartArguments,
+    RegisterArguments,
+    ReportArguments,
+    StartArguments,
+    TrainArguments,
+    WatchArguments,
+)
+from .config import (
+    BodySection,
+    Config,
+    ConfigError,
+    LoadsSection,
+    MaterialSection,
+    RegistrationSection,
+    SamplesSection,
+    TrainingSection,
+    parse_config,
+    to_toml,
+)
+from .flags import Commands, flags
 from .register import NOTICE
 
 # What libraries tell those who write programs with them.
 _FOR_DEVELOPERS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning, ImportWarning, ResourceWarning)
 _PATH = click.Path(path_type=Path)
 _EXISTING = click.Path(exists=True, path_type=Path)
-_DEVICE = click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="Where to train; auto: on a GPU where torch sees one.",
-)
-_PROCESSES = click.option(
-    "--processes",
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help="Processes that train together: a GPU each, or cores of this machine.",
-)
+_KNOWN_LOADS = ("known_forces", "gravity", "pressure")
 
 
-def _known_loads(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options for what is known to act."""
-    options = (
-        click.option("--known-forces", type=_EXISTING, help="Known nodal forces that act along: .npy (n, 3), newtons."),
-        click.option("--gravity", type=float, nargs=3, help="That acts beyond what the body has at rest, m/s^2."),
-        click.option("--pressure", type=float, help="On the whole boundary, pascals, following it."),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
-
-
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(package_name="softtwin")
 def softtwin() -> None:
     """Turn the surface of a soft organ into a real-time digital twin.
@@ -95,20 +100,18 @@ def mesh(configuration: Path) -> None:
 
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
-@click.option("--redo", multiple=True, type=int, help="Make this block again (may be repeated).")
-@click.option("--again", is_flag=True, help="Throw a data set that is there away, and make it anew.")
-@click.option("--part", metavar="I/N", help="Solve part I of N alone, I from 0, beside other jobs (examples/slurm.sh).")
+@flags(GenerateArguments)
 def generate(configuration: Path, redo: tuple[int, ...], again: bool, part: str | None) -> None:
     """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped.
 
     Blocks that are damaged are found and made again. Another body or configuration is refused. Once all parts of an
     array of jobs have ended, `generate` without `--part` makes what is missing, and the Jacobians.
     """
-    from softtwin.reference.data.part import Part
+    from softtwin.reference.data.shard import Shard
 
     from .stages.generate import describe_data, generate_stage
 
-    chosen = None if part is None else Part.parse(part)
+    chosen = None if part is None else Shard.parse(part)
     data = generate_stage(configuration, redo, again, chosen)
     if data is not None and chosen is not None:
         missing = len(data.missing_blocks())
@@ -137,7 +140,7 @@ def show_data(source: Path) -> None:
 @data_commands.command("export")
 @click.argument("source", type=_EXISTING)
 @click.argument("output", type=_PATH)
-@click.option("--draw", "draws", multiple=True, type=int, help="Number of a draw (may be repeated).")
+@flags(DrawArguments)
 def export_data(source: Path, output: Path, draws: tuple[int, ...]) -> None:
     """Write draws of SOURCE into OUTPUT (VTU, PNG): those that move least, most and in the median, or --draw."""
     from softtwin.reference.data.summary import summary
@@ -191,9 +194,8 @@ def merge_data(sources: tuple[Path, ...], output: Path) -> None:
 
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
-@click.option("--fresh", is_flag=True, help="Throw earlier checkpoints away instead of going on from them.")
-@_DEVICE
-@_PROCESSES
+@flags(FreshArguments)
+@flags(TrainArguments)
 def train(configuration: Path, fresh: bool, device: Any, processes: int) -> None:
     """Train the surrogate of CONFIGURATION on its data set and write the twin. Goes on from the last checkpoint."""
     from .stages.learn import train_stage
@@ -214,24 +216,23 @@ def validate(configuration: Path) -> None:
     click.echo(validate_stage(open_workspace(configuration)))
 
 
-@softtwin.command()
+@softtwin.command("model-error")
 @click.argument("configuration", type=_EXISTING)
-def doubt(configuration: Path) -> None:
-    """Solve what CONFIGURATION's organ may be otherwise ([doubt]): margins know of it; also under `mpirun -n N`.
+def model_error(configuration: Path) -> None:
+    """Solve the model-error ensemble of CONFIGURATION ([model_error]), for the margins; also under `mpirun -n N`.
 
-    What holds the organ may lie elsewhere, or its Poisson's ratio be another. Goes on where it was stopped.
+    Its models have another attachment, Poisson's ratio or mesh. The command goes on where it was stopped.
     """
-    from .stages.doubt import doubt_stage
+    from .stages.model_error import model_error_stage
 
-    found = doubt_stage(configuration)
+    found = model_error_stage(configuration)
     if found is not None:
         click.echo(f"    {found}")
 
 
 @softtwin.command()
 @click.argument("twin", type=_EXISTING)
-@click.option("--output", type=_PATH, help="Folder to write; TWIN/onnx if not given.")
-@click.option("--directions", default=64, show_default=True, type=click.IntRange(1), help="Of force in the Jacobian.")
+@flags(ExportArguments)
 def export(twin: Path, output: Path | None, directions: int) -> None:
     """Write the surrogate of TWIN as graphs for other programs (ONNX and torch.export): displacement and Jacobian."""
     from softtwin.meshes.files import read_body
@@ -245,105 +246,20 @@ def export(twin: Path, output: Path | None, directions: int) -> None:
 @softtwin.command()
 @click.argument("twin", type=_EXISTING)
 @click.argument("clouds", nargs=-1, required=True)
-@click.option(
-    "--model",
-    "--engine",
-    "model",
-    type=click.Choice(["surrogate", "reference", "hybrid"]),
-    help="Forward model; hybrid: the surrogate first, the reference from there.",
-)
-@click.option("--zone", help="Node set whose nodes may carry force; '' for all loaded nodes.")
-@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
-@click.option(
-    "--frame",
-    "axes",
-    type=click.Choice(["lps", "ras"], case_sensitive=False),
-    help="Axes of the clouds; the organ's if not given.",
-)
-@click.option("--noise", type=float, help="Noise of a point, metres, that the search for it begins with.")
-@click.option("--noise-known", is_flag=True, default=None, help="Hold the noise at --noise instead of finding it.")
-@click.option(
-    "--force-scale", type=float, help="Nodal force, newtons, that the search for its size begins with; 0: by stiffness."
-)
-@click.option("--smoothness", type=float, help="Correlation length of neighbouring forces, metres; 0: none.")
-@click.option("--directions", type=int, help="Most directions of force kept.")
-@click.option("--points", type=int, help="Most points of a cloud used; larger clouds are thinned.")
-@click.option(
-    "--distance",
-    type=click.Choice(["surface", "plane"]),
-    help="Of points to the surface, or to the planes of its triangles, along which they slide.",
-)
-@click.option("--normals", is_flag=True, default=None, help="Read the normals in the clouds' files: they pull, too.")
-@click.option("--normal-deviation", type=float, help="Standard deviation of such a normal across itself, degrees.")
-@click.option("--rounds", type=int, help="How often a cold start gathers the forces where it has found some.")
-@click.option("--solver", type=click.Choice(["gauss-newton", "l-bfgs"]), help="How the objective is minimised.")
-@click.option(
-    "--penalty",
-    type=click.Choice(["prior", "amplitude", "divergence"]),
-    help="What forces cost: by their Gaussian prior, or by l-bfgs with their size or divergence in its place.",
-)
-@click.option("--alpha", type=float, help="Weight of such a penalty beside the distances, in [0, 1].")
-@click.option("--max-iterations", type=int, help="Most iterations; 0: what the solver is content with.")
-@click.option(
-    "--unknown",
-    "unknowns",
-    multiple=True,
-    help="Unknown beside the forces: young-modulus, young-modulus@TUMOUR, poisson-ratio, moved@ZONE, contact; "
-    "=DEVIATION behind it (may be repeated).",
-)
-@_known_loads
-@click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")
-@click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
-@click.option("--align", type=click.Choice(["auto"]), help="Look for the pose in the first cloud that shows it.")
-@click.option(
-    "--marks",
-    nargs=2,
-    type=_EXISTING,
-    metavar="BODY CAMERA",
-    help="Named points that pull beside the clouds: on the organ at rest, and a folder with a file for each cloud, "
-    "named like it (or a file, for one cloud).",
-)
-@click.option("--landmark-deviation", type=float, help="Standard deviation of where --marks were found, metres.")
-@click.option(
-    "--pose",
-    type=click.Choice(["fixed", "unknown"]),
-    help="Unknown: found with the forces, as after any start. Fixed: exactly as given.",
-)
-@click.option("--pose-turn", type=float, help="How far an unknown pose may turn from its start, degrees.")
-@click.option("--pose-shift", type=float, help="How far an unknown pose may shift from its start, metres.")
-@click.option("--known-turn", type=float, help="How well a pose that is not asked for is known, degrees; 0: exactly.")
-@click.option("--known-shift", type=float, help="The same of its shift, metres.")
-@click.option(
-    "--format",
-    "formats",
-    multiple=True,
-    help="vtu: the organ; stl, ply, obj, vtp: surfaces; nrrd: displacement field; mrk.json: targets; seq.mrb: "
-    "sequences (may be repeated).  [vtu, vtp]",
-)
-@click.option("--output-frame", type=click.Choice(["lps", "ras", "source"]), help="Axes of the results.  [lps]")
-@click.option("--output-unit", type=click.Choice(["mm", "m", "source"]), help="Unit of the results' files.  [mm]")
-@click.option("--voxel", type=float, help="Edge of a voxel of the displacement field, metres; 0: 64 along the organ.")
-@click.option("--target-points", type=int, help="Points of each inner surface in mrk.json, beside its centre.")
-@click.option("--truth", type=_EXISTING, help="True node positions in .npy, metres, (frames, n, 3), to state errors.")
-@click.option("--budget", type=float, help="Seconds for a frame, after which the best so far is taken.")
-@click.option(
-    "--watch",
-    is_flag=True,
-    help="CLOUDS is a folder that is written to, or a place of OpenIGTLink (igtl://HOST:PORT, igtl://:PORT to listen; "
-    "mm and RAS if not given): register the newest, until Ctrl-C.",
-)
-@click.option("--idle", type=float, help="With --watch: end after so many seconds without a new cloud.")
-@click.option("--strict", is_flag=True, help="End with code 3 unless every frame is accepted.")
-@click.option("--output", type=_PATH, default=Path("registration"), show_default=True, help="Folder of the results.")
+@flags(CloudArguments)
+@flags(StartArguments)
+@flags(RegistrationSection, without=("forces", "budget"), unset=True)
+@flags(WatchArguments)
+@flags(RegisterArguments)
 def register(
     twin: Path,
     clouds: tuple[str, ...],
     unit: Unit | None,
-    axes: Axes | None,
-    matrix: Path | None,
+    frame: Axes | None,
+    start: Path | None,
     landmarks: tuple[Path, Path] | None,
     align: str | None,
-    marks: tuple[Path, Path] | None,
+    frame_landmarks: tuple[Path, Path] | None,
     formats: tuple[str, ...],
     truth: Path | None,
     budget: float | None,
@@ -362,19 +278,20 @@ def register(
 
     A peer of OpenIGTLink gets each answer back: a POLYDATA for every structure, the TRANSFORM pose, the STRING figures.
 
-    TWIN is a twin's folder; with --model reference a folder with a body and its configuration is enough.
+    TWIN is a twin's folder; with --model reference a folder with a body and its configuration is enough. What is not
+    given is as in the twin's organ.toml; the defaults below are those of a new one.
     """
+    from .address import SCHEME, parse_source
     from .export import FORMATS
     from .register import Start, register_files
-    from .sources import SCHEME, parse_source
 
     unknown = [name for name in formats if name not in FORMATS]
     if unknown:
         raise ConfigError(f"--format: expected {', '.join(FORMATS)}, got {', '.join(unknown)}.")
-    if sum(given is not None for given in (matrix, landmarks or None, align)) > 1:
+    if sum(given is not None for given in (start, landmarks or None, align)) > 1:
         raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
     options = _given(chosen)
-    start = Start(matrix, landmarks or None, align is not None, marks or None)
+    begin = Start(start, landmarks or None, align is not None, frame_landmarks or None)
     if idle is not None and not watch:
         raise ConfigError("--idle: expected --watch beside it.")
     if not watch and any(name.startswith(f"{SCHEME}://") for name in clouds):
@@ -385,12 +302,12 @@ def register(
         if len(clouds) != 1 or truth is not None:
             raise ConfigError("--watch: expected one folder or igtl://... and no --truth.")
         verdicts = watch_source(
-            twin, parse_source(clouds[0]), output, options, unit=unit, axes=axes, start=start, formats=formats,
+            twin, parse_source(clouds[0]), output, options, unit=unit, axes=frame, start=begin, formats=formats,
             budget=budget, idle=idle, say=click.echo,
         )  # fmt: skip
     else:
         verdicts = register_files(
-            twin, clouds, output, options, unit=unit, axes=axes, start=start, truth=truth, formats=formats,
+            twin, clouds, output, options, unit=unit, axes=frame, start=begin, truth=truth, formats=formats,
             budget=budget, say=click.echo,
         )  # fmt: skip
     said = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items() if count)
@@ -402,45 +319,38 @@ def register(
 @softtwin.command()
 @click.argument("twin", type=_EXISTING)
 @click.argument("clouds", nargs=-1, required=True)
-@click.option(
-    "--unknown",
-    "unknowns",
-    multiple=True,
-    required=True,
-    help="What is to be found: young-modulus, young-modulus@TUMOUR, poisson-ratio, moved@ZONE; =DEVIATION behind it "
-    "(may be repeated).",
+@flags(CloudArguments, ("unit",))
+@flags(StartArguments, ("start", "landmarks"))
+@flags(
+    RegistrationSection,
+    ("parameters", *_KNOWN_LOADS, "noise", "noise_known", "points"),
+    unset=True,
+    required=("parameters",),
 )
-@_known_loads
-@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
-@click.option("--noise", type=float, help="Noise of a point, metres, that the search for it begins with.")
-@click.option("--noise-known", is_flag=True, default=None, help="Hold the noise at --noise instead of finding it.")
-@click.option("--points", type=int, help="Most points of a cloud used; larger clouds are thinned.")
-@click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")
-@click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
-@click.option("--output", type=_PATH, default=Path("identification"), show_default=True, help="Folder of the results.")
+@flags(IdentifyArguments)
 def identify(
     twin: Path,
     clouds: tuple[str, ...],
     unit: Unit | None,
-    matrix: Path | None,
+    start: Path | None,
     landmarks: tuple[Path, Path] | None,
     output: Path,
     **chosen: Any,
 ) -> None:
     """Find what TWIN is made of from CLOUDS under known loads: stiffness, Poisson's ratio, where a region has gone.
 
-    Each cloud is a state under the same loads, or of the same unknowns; what all of them say together stands at the
-    end, with the interval that holds it with 90 %. An unknown that they do not tell is called so. Ends with code 3
-    where no cloud could be used. Where forces are unknown as well, use `softtwin register --unknown`.
+    Each cloud is a state under the same loads, or of the same parameters; what all of them say together stands at the
+    end, with the interval that holds it with 90 %. A parameter that they do not inform is called so. Ends with code 3
+    where no cloud could be used. Where forces are unknown as well, use `softtwin register --parameter`.
     """
     from .identify import identify_files
     from .register import Start
 
-    if matrix is not None and landmarks:
+    if start is not None and landmarks:
         raise ConfigError("--start, --landmarks: expected one of them, got both.")
     options = _given(chosen) | {"model": "reference", "forces": "known"}
-    start = Start(matrix, landmarks or None)
-    used = identify_files(twin, clouds, output, options, unit=unit, start=start, say=click.echo)
+    begin = Start(start, landmarks or None)
+    used = identify_files(twin, clouds, output, options, unit=unit, start=begin, say=click.echo)
     click.echo(f"written to {output}\n{NOTICE}")
     if not used:
         sys.exit(3)
@@ -454,9 +364,7 @@ def _given(chosen: dict[str, Any]) -> dict[str, Any]:
 
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
-@click.option(
-    "--registrations", multiple=True, type=_EXISTING, help="Folder that softtwin register wrote (may be repeated)."
-)
+@flags(ReportArguments)
 def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
     """Write the HTML report of what CONFIGURATION's stages have made so far, and of registrations.
 
@@ -472,56 +380,17 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 
 @softtwin.command()
 @click.argument("surface_or_mesh", type=_PATH)
-@click.option("--organ", default="", help="Label of a segmentation to build from; the liver if not given.")
-@click.option("--fixed", multiple=True, metavar="WHERE", help="What holds the organ (may be repeated).")
-@click.option(
-    "--fixed-distance", type=float, default=0.0, help="How near to a file of --fixed a node is fixed, m; 0: one cell."
+@flags(
+    BodySection,
+    ("unit", "frame", "fixed", "observed", "zones", "inner", "nodes", "organ", "fixed_distance", "cell_size", "grid"),
+    unset=("unit", "frame"),
 )
-@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the files that state none.  [m]")
-@click.option(
-    "--frame",
-    type=click.Choice(["lps", "ras"], case_sensitive=False),
-    help="Axes of the files that say none.",
-)
-@click.option("--observed", multiple=True, metavar="WHERE", help="The side that a camera sees.")
-@click.option("--zone", "zones", multiple=True, metavar="NAME=WHERE", help="Where tools may touch (may be repeated).")
-@click.option(
-    "--inner",
-    multiple=True,
-    metavar="NAME[=FILE]",
-    help="A vessel or tumour to carry along: its surface; of a segmentation NAME or NAME=LABEL.",
-)
-@click.option("--nodes", type=int, default=2000, show_default=True, help="Nodes wanted where a surface is made solid.")
-@click.option("--cell-size", type=float, default=0.0, help="Edge length instead, metres.")
-@click.option(
-    "--grid", type=float, default=0.0, help="A regular grid of hexahedra of this edge length instead of tetrahedra, m."
-)
-@click.option("--law", type=click.Choice(LAWS), default="neo-hookean", show_default=True)
-@click.option("--young-modulus", type=float, default=5000.0, show_default=True, help="Pascals.")
-@click.option("--poisson-ratio", type=float, default=0.45, show_default=True)
-@click.option(
-    "--displacement", type=float, default=0.05, show_default=True, help="Largest displacement to learn, metres."
-)
-@click.option("--samples", type=int, default=512, show_default=True, help="Equilibria to learn from.")
-@click.option(
-    "--jacobians/--no-jacobians",
-    default=True,
-    show_default=True,
-    help="Learn from the Jacobians of the equilibria too.",
-)
-@click.option(
-    "--ramp", type=int, default=1, show_default=True, help="Draws that share a load at growing sizes (cheaper)."
-)
-@click.option(
-    "--seconds", type=float, default=120.0, show_default=True, help="Wall time to train; ends with the step under way."
-)
-@click.option("--ranks", type=int, default=0, help="MPI ranks; 0: one a core.")
-@_DEVICE
-@_PROCESSES
-@click.option(
-    "--output", type=_PATH, default=Path("twin-run"), show_default=True, help="Folder of everything that is made."
-)
-@click.option("--again", is_flag=True, help="Throw equilibria that were solved in OUTPUT before away.")
+@flags(MaterialSection, ("young_modulus", "poisson_ratio", "law"))
+@flags(SamplesSection, ("train", "jacobians", "load_path", "ranks"))
+@flags(LoadsSection, ("displacement",))
+@flags(TrainingSection, ("seconds",))
+@flags(TrainArguments)
+@flags(BuildArguments)
 def build(
     surface_or_mesh: Path, zones: tuple[str, ...], inner: tuple[str, ...], output: Path, again: bool, **given: Any
 ) -> None:
@@ -567,12 +436,12 @@ def build(
         "material": {name: given[name] for name in ("law", "young_modulus", "poisson_ratio")},
         "loads": {"displacement": given["displacement"], "zones": sorted(body["zones"])},
         "samples": {
-            "train": given["samples"],
-            "validation": max(8, given["samples"] // 8),
-            "test": max(8, given["samples"] // 4),
-            "calibration": max(12, given["samples"] // 4),
+            "train": given["train"],
+            "validation": max(8, given["train"] // 8),
+            "test": max(8, given["train"] // 4),
+            "calibration": max(12, given["train"] // 4),
             "ranks": given["ranks"],
-            "ramp": given["ramp"],
+            "load_path": given["load_path"],
             "jacobians": given["jacobians"],
         },
         "training": {"seconds": given["seconds"]},
@@ -630,16 +499,7 @@ def _resolved(where: str) -> str:
 
 
 @softtwin.command()
-@click.option(
-    "--output",
-    type=_PATH,
-    default=Path("softtwin-quickstart"),
-    show_default=True,
-    help="Folder of everything that is made.",
-)
-@click.option(
-    "--small", is_flag=True, help="A coarse organ and few samples: the same path in about a minute, for tests."
-)
+@flags(QuickstartArguments)
 def quickstart(output: Path, small: bool) -> None:
     """Run the whole chain on a liver phantom: mesh, modes, equilibria, surrogate, registration, report (minutes)."""
     from .quickstart import run_quickstart
@@ -647,19 +507,9 @@ def quickstart(output: Path, small: bool) -> None:
     run_quickstart(output, small, click.echo)
 
 
-_PORT = click.option(
-    "--port", type=click.IntRange(1, 65535), help="Of the page; the first free one from 8080 on if not given."
-)
-_BROWSER = click.option(
-    "--browser/--no-browser", default=True, show_default=True, help="Open the page where there is a display."
-)
-
-
 @softtwin.command()
-@_PORT
-@_BROWSER
-@click.option("--record", type=_PATH, help="Record the scene to this HTML file, which plays by itself, and end.")
-@click.option("--seconds", type=click.FloatRange(0.5, 120.0), default=8.0, show_default=True, help="To record.")
+@flags(PageArguments)
+@flags(DemoArguments)
 def demo(port: int | None, browser: bool, record: Path | None, seconds: float) -> None:
     """Show a live page on this machine: a liver phantom before a simulated camera; pull at it with the mouse.
 
@@ -673,33 +523,17 @@ def demo(port: int | None, browser: bool, record: Path | None, seconds: float) -
 @softtwin.command()
 @click.argument("twin", type=_EXISTING)
 @click.argument("source")
-@click.option(
-    "--model",
-    "--engine",
-    "model",
-    type=click.Choice(["surrogate", "reference", "hybrid"]),
-    help="Forward model to begin with; the page can change it.",
-)
-@click.option("--zone", help="Node set whose nodes may carry force; '' for all loaded nodes.")
-@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the clouds; the organ's if not given.")
-@click.option(
-    "--frame",
-    "axes",
-    type=click.Choice(["lps", "ras"], case_sensitive=False),
-    help="Axes of the clouds; the organ's if not given.",
-)
-@click.option("--start", "matrix", type=_EXISTING, help="4 x 4 matrix, body at rest to camera (TXT CSV NPY JSON TFM).")
-@click.option("--landmarks", nargs=2, type=_EXISTING, metavar="BODY CAMERA", help="Named points on both sides.")
-@click.option("--align", type=click.Choice(["auto"]), help="Look for the pose in the first cloud that shows it.")
-@click.option("--idle", type=float, help="End after so many seconds without a new cloud.")
-@_PORT
-@_BROWSER
+@flags(CloudArguments)
+@flags(StartArguments)
+@flags(RegistrationSection, ("model", "zone"), unset=True)
+@flags(WatchArguments, ("idle",))
+@flags(PageArguments)
 def live(
     twin: Path,
     source: str,
     unit: Unit | None,
-    axes: Axes | None,
-    matrix: Path | None,
+    frame: Axes | None,
+    start: Path | None,
     landmarks: tuple[Path, Path] | None,
     align: str | None,
     idle: float | None,
@@ -712,26 +546,23 @@ def live(
     SOURCE is a folder that is written to, or a place of OpenIGTLink (igtl://HOST:PORT, igtl://:PORT to listen; mm and
     RAS if not given). Nothing is written or sent back; `softtwin register --watch` does that.
     """
+    from .address import parse_source
     from .page.stream import run_live
     from .register import Start
-    from .sources import parse_source
 
-    if sum(given is not None for given in (matrix, landmarks or None, align)) > 1:
+    if sum(given is not None for given in (start, landmarks or None, align)) > 1:
         raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
-    start = Start(matrix, landmarks or None, align is not None)
+    begin = Start(start, landmarks or None, align is not None)
     run_live(
-        twin, parse_source(source), _given(chosen), unit=unit, axes=axes, start=start, idle=idle, port=port,
+        twin, parse_source(source), _given(chosen), unit=unit, axes=frame, start=begin, idle=idle, port=port,
         browser=browser, say=click.echo,
     )  # fmt: skip
 
 
 @softtwin.command()
 @click.argument("organ", type=_PATH)
-@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), default="m", show_default=True, help="Unit of the files.")
-@click.option("--frame", type=click.Choice(["lps", "ras"], case_sensitive=False), help="Axes of files that say none.")
-@click.option("--inner", multiple=True, metavar="NAME=FILE", help="A vessel or tumour surface to show along.")
-@_PORT
-@_BROWSER
+@flags(PickArguments)
+@flags(PageArguments)
 def pick(organ: Path, unit: Unit, frame: str | None, inner: tuple[str, ...], port: int | None, browser: bool) -> None:
     """Show a page on which one clicks what holds ORGAN, and get the words for --fixed.
 

@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-import reprlib
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import tomlkit
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from softtwin.meshes.attachment import parse_file
 from softtwin.meshes.files import SEGMENTATIONS, Axes
 
-from .unknowns import WORDS as UNKNOWNS
-from .unknowns import Unknown
+from .parameters import WORDS as PARAMETERS
+from .parameters import NamedParameter
+from .schema import ConfigError as ConfigError
+from .schema import Section, described, option, option_of, part
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
 
 
 _SURFACES = (".stl", ".ply", ".obj", ".vtp", *SEGMENTATIONS)
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message names every wrong entry, what was expected and what came."""
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 # What says where something is: `meshes/attachment.py` reads it.
@@ -38,46 +30,60 @@ _WHERE = (
 )
 
 
-class BodySection(_Section):
+class BodySection(Section):
     """Where the body comes from. A file with another unit or axes has them behind its name (veins.ply:mm:ras)."""
 
-    source: str = Field(
+    source: str = option(
         "liver-phantom",
-        description="a surface or mesh file (STL PLY OBJ VTK VTU VTP MSH), a segmentation (NII NRRD, or a folder of "
-        "them), or a shape: liver-phantom, propeller, beam",
+        "a surface or mesh file (STL PLY OBJ VTK VTU VTP MSH), a segmentation (NII NRRD, or a folder of them), or a "
+        "shape: liver-phantom, propeller, beam",
     )
-    organ: str = Field("", description="label of a segmentation that the body is made from; empty: the liver")
-    unit: Literal["m", "cm", "mm"] = Field("m", description="unit of length in the files")
-    frame: Literal["", "lps", "ras"] = Field(
-        "",
-        description="axes of the files that say none, lps or ras; files in ras are turned, inside it is lps",
+    organ: str = option("", "label of a segmentation that the body is made from; empty: the liver")
+    unit: Literal["m", "cm", "mm"] = option("m", "unit of length of the files that state none", basic=True)
+    frame: Literal["", "lps", "ras"] = option(
+        "", "axes of the files that state none, lps or ras; files in ras are rotated, inside it is lps"
     )
-    cell_size: float = Field(0.0, ge=0.0, description="edge length of the tetrahedra in metres; 0: from nodes")
-    nodes: Count = Field(2000, description="number of nodes wanted where a surface is made solid and cell_size is 0")
-    grid: float = Field(
+    cell_size: float = option(0.0, "edge length of the tetrahedra; 0: from nodes", unit="metres", ge=0.0)
+    nodes: int = option(
+        2000, "number of nodes wanted where a surface is made solid and cell_size is 0", ge=1, basic=True
+    )
+    grid: float = option(
         0.0,
+        "edge length of the hexahedra of a regular grid that carries the organ's surface, in place of tetrahedra "
+        "(architecture umesh wants it); 0: none",
+        unit="metres",
         ge=0.0,
-        description="edge length, metres, of the hexahedra of a regular grid that carries the organ's surface, in "
-        "place of tetrahedra (architecture umesh wants it); 0: none",
     )
-    fixed: str = Field(
+    fixed: str = option(
         "",
-        description=f"what holds the organ: points or triangles near it, .npy/.txt of node numbers, or {_WHERE}",
+        f"what holds the organ: points or triangles near it, .npy/.txt of node numbers, or {_WHERE}",
+        basic=True,
+        repeated=True,
+        metavar="WHERE",
     )
-    fixed_distance: float = Field(
-        0.0, ge=0.0, description="how near to a file of fixed a node is fixed, in metres; 0: one cell"
+    fixed_distance: float = option(
+        0.0, "how near to a file of fixed a node is fixed; 0: one cell", unit="metres", ge=0.0
     )
-    observed: str = Field(
+    observed: str = option(
         "",
-        description="what a camera sees: a surface file, (t, 3) node numbers in .npy, or words as for fixed; "
+        "observed surface, which a camera sees: a surface file, (t, 3) node numbers in .npy, or words as for fixed; "
         "empty: the whole boundary",
+        basic=True,
+        repeated=True,
+        metavar="WHERE",
     )
-    zones: dict[str, str] = Field(
-        default_factory=dict, description="named zones that tools may touch: files or words as for fixed"
+    zones: dict[str, str] = option(
+        {},
+        "named zones that tools may touch: files or words as for fixed",
+        basic=True,
+        flag="--zone",
+        metavar="NAME=WHERE",
     )
-    inner: dict[str, str] = Field(
-        default_factory=dict,
-        description="named inner surfaces (vessels, tumours): surface files, or labels of a segmentation",
+    inner: dict[str, str] = option(
+        {},
+        "named inner surfaces (vessels, tumours): surface files, or labels of a segmentation",
+        basic=True,
+        metavar="NAME[=FILE]",
     )
 
 
@@ -85,236 +91,322 @@ Law = Literal["neo-hookean", "saint-venant-kirchhoff", "isochoric-neo-hookean", 
 LAWS: tuple[str, ...] = get_args(Law)
 
 
-class MaterialSection(_Section):
+class MaterialSection(Section):
     """The tissue."""
 
-    law: Law = Field("neo-hookean", description="strain energy")
-    young_modulus: Positive = Field(5000.0, description="pascals")
-    young_modulus_deviation: float = Field(
+    group: ClassVar[str] = "material"
+
+    law: Law = option("neo-hookean", "strain energy")
+    young_modulus: float = option(5000.0, "Young's modulus", unit="pascals", gt=0.0, basic=True)
+    young_modulus_deviation: float = option(
         0.0,
+        "standard deviation of the logarithm of Young's modulus (0.3: a third), which adds to the uncertainty of the "
+        "forces found; displacements under forces alone do not depend on it",
         ge=0.0,
-        description="what is not known of it: standard deviation of its logarithm (0.3: a third), which forces found "
-        "are the more in doubt by; displacements under forces alone do not depend on it",
     )
-    poisson_ratio: float = Field(0.45, gt=0.0, lt=0.5, description="between 0 and 0.5; soft tissue 0.45 to 0.49")
-    density: Positive = Field(1060.0, description="kg/m^3, for weight where gravity acts")
+    poisson_ratio: float = option(0.45, "Poisson's ratio; soft tissue 0.45 to 0.49", gt=0.0, lt=0.5)
+    density: float = option(1060.0, "mass density, for weight where gravity acts", unit="kg/m^3", gt=0.0)
 
 
-class LoadsSection(_Section):
-    """The loads that the twin learns from (modes of the stiffness at rest, masked to patches)."""
+class LoadsSection(Section):
+    """The loads that the twin learns from (modes of the stiffness of the undeformed body, masked to patches)."""
 
-    kind: Literal["modal", "random"] = Field(
-        "modal", description="modal loads, or independent nodal forces to compare with"
+    group: ClassVar[str] = "equilibria"
+
+    kind: Literal["modal", "random"] = option("modal", "modal loads, or independent nodal forces to compare with")
+    modes: int = option(10, "eigenmodes that make the loads", ge=1)
+    patches: int = option(2, "maximum number of patches that act at once", ge=1)
+    radius: tuple[Positive, Positive] = option((0.06, 0.65), "smallest and largest patch, relative to its zone")
+    zones: tuple[str, ...] = option((), "names of zones that carry the loads; empty: the whole boundary")
+    displacement: float = option(
+        0.05, "largest displacement to learn; the loads are scaled to it", unit="metres", gt=0.0
     )
-    modes: Count = Field(10, description="eigenmodes that make the loads")
-    patches: Count = Field(2, description="most patches that act at once")
-    radius: tuple[Positive, Positive] = Field(
-        (0.06, 0.65), description="smallest and largest patch, relative to its zone"
+    amplitude: float = option(
+        0.0, "fixed amplitude of the loads instead; 0: scale to the displacement", unit="newtons", ge=0.0
     )
-    zones: tuple[str, ...] = Field((), description="names of zones that carry the loads; empty: the whole boundary")
-    displacement: Positive = Field(0.05, description="largest displacement wanted, metres; the loads are scaled to it")
-    amplitude: float = Field(
-        0.0, ge=0.0, description="fixed amplitude in newtons instead; 0: scale to the displacement"
-    )
-    sequence: Literal["random", "sobol"] = Field(
-        "random", description="how training loads are spread: at random, or evenly by a Sobol sequence"
+    sequence: Literal["random", "sobol"] = option(
+        "random", "how training loads are spread: at random, or evenly by a Sobol sequence"
     )
 
 
-class SamplesSection(_Section):
+class SamplesSection(Section):
     """How many equilibria."""
 
-    train: Count = Field(512, description="draws to learn from")
-    validation: Count = Field(64, description="draws to choose the best weights with")
-    test: Count = Field(128, description="draws held out, never seen in training")
-    calibration: int = Field(
-        0,
-        ge=0,
-        description="draws to calibrate bounds on errors with, neither learned nor chosen from; 0: no bounds",
+    group: ClassVar[str] = "equilibria"
+
+    train: int = option(512, "equilibria to learn from", ge=1, basic=True, flag="--samples")
+    validation: int = option(64, "draws to choose the best weights with", ge=1)
+    test: int = option(128, "draws held out, never seen in training", ge=1)
+    calibration: int = option(
+        0, "draws to calibrate error bounds with, neither learned nor chosen from; 0: no bounds", ge=0
     )
-    rounds: int = Field(
+    rounds: int = option(
         0,
+        "active rounds: how often further draws to learn from are chosen, where the network trained on those before "
+        "is least in balance; 0: none",
         ge=0,
-        description="active rounds: how often further draws to learn from are chosen, where the network trained on "
-        "those before is least in balance; 0: none",
     )
-    chosen: Count = Field(64, description="draws chosen in each active round, in whole blocks")
-    candidates: Count = Field(16, description="loads looked at for each that is chosen")
-    block: Count = Field(8, description="draws in one block of work")
-    ramp: Count = Field(
+    chosen: int = option(64, "draws chosen in each active round, in whole blocks", ge=1)
+    candidates: int = option(16, "loads looked at for each that is chosen", ge=1)
+    block: int = option(8, "draws in one block of work", ge=1)
+    load_path: int = option(
         1,
-        validation_alias=AliasChoices("ramp", "path"),
-        description="draws that share a load at growing sizes, each solved from the one before; divides block",
+        "draws on one load path: they share a load at growing amplitudes, each solved from the one before (cheaper); "
+        "divides block",
+        ge=1,
+        old=("ramp", "path"),
     )
-    jacobians: bool = Field(
+    jacobians: bool = option(
         True,
-        description="also the Jacobian of each training equilibrium in the reduced network's modes, which tell it more "
-        "than further samples do; takes about half as long again; other networks have none",
+        "also the Jacobian of each training equilibrium in the reduced network's modes, which tell it more than "
+        "further samples do; takes about half as long again; other networks have none",
     )
-    seed: int = Field(0, ge=0, description="seed of everything random")
-    ranks: int = Field(0, ge=0, description="MPI ranks that build and quickstart start; 0: one a core")
+    seed: int = option(0, "seed of everything random", ge=0)
+    ranks: int = option(0, "MPI ranks that build and quickstart start; 0: one a core", ge=0)
 
     @model_validator(mode="after")
-    def _ramp_divides_block(self) -> SamplesSection:
-        if self.block % self.ramp:
-            raise ValueError(f"samples.ramp: expected a divisor of samples.block ({self.block}), got {self.ramp}")
+    def _load_path_divides_block(self) -> SamplesSection:
+        if self.block % self.load_path:
+            raise ValueError(
+                f"samples.load_path: expected a divisor of samples.block ({self.block}), got {self.load_path}"
+            )
         if self.rounds and self.chosen % self.block:
             raise ValueError(f"samples.chosen: expected whole blocks of {self.block} draws, got {self.chosen}")
         return self
 
 
-class SolverSection(_Section):
+class SolverSection(Section):
     """Newton's method in the reference."""
 
-    tolerance: float = Field(1e-8, gt=0.0, lt=1.0, description="residual relative to the forces")
-    max_iterations: Count = Field(60, description="iterations of one load step")
-    max_load_steps: Count = Field(20, description="load steps tried before a draw is rejected")
+    group: ClassVar[str] = "solver"
+
+    tolerance: float = option(1e-8, "residual relative to the forces", gt=0.0, lt=1.0)
+    max_iterations: int = option(60, "maximum number of iterations of one load step", ge=1)
+    max_load_steps: int = option(20, "load steps tried before a draw is rejected", ge=1)
 
 
-class TrainingSection(_Section):
+class TrainingSection(Section):
     """The surrogate."""
 
-    architecture: Literal["reduced", "mlp", "umesh", "transolver"] = Field(
+    group: ClassVar[str] = "training"
+
+    architecture: Literal["reduced", "mlp", "umesh", "transolver"] = option(
         "reduced",
-        description="reduced network; as yardsticks the thesis's perceptron (mlp) and U-Mesh (umesh, on a regular "
-        "grid), and a transolver",
+        "reduced network; as yardsticks the thesis's perceptron (mlp) and U-Mesh (umesh, on a regular grid), and a "
+        "transolver",
     )
-    modes: Count = Field(64, description="displacement modes (POD) of the reduced network")
-    width: Count = Field(256, description="width of its blocks")
-    seconds: Positive = Field(
-        120.0, description="wall time to train: ends with the step under way; reading the data not counted"
+    modes: int = option(64, "displacement modes (POD) of the reduced network", ge=1)
+    width: int = option(256, "width of its blocks", ge=1)
+    seconds: float = option(
+        120.0,
+        "wall time to train: ends with the step under way; reading the data not counted",
+        unit="seconds",
+        gt=0.0,
+        basic=True,
     )
-    epochs: int = Field(
+    epochs: int = option(
         0,
+        "passes over the samples (reduced network: and their symmetric images) instead, whatever time they take; 0: "
+        "by seconds",
         ge=0,
-        description="passes over the samples (reduced network: and their symmetric images) instead, whatever time they "
-        "take; 0: by seconds",
     )
-    seed: int = Field(0, ge=0, description="seed of the weights and the order of samples")
-    precision: Literal["single", "mixed"] = Field(
-        "single", description="mixed: products in bfloat16, for large networks on a GPU"
+    seed: int = option(0, "seed of the weights and the order of samples", ge=0)
+    precision: Literal["single", "mixed"] = option("single", "mixed: products in bfloat16, for large networks on a GPU")
+    patience: int = option(
+        0, "end after so many of the 40 rounds without a smaller validation error; 0: never early", ge=0
     )
-    patience: int = Field(
-        0, ge=0, description="end after so many of the 40 rounds without a smaller validation error; 0: never early"
+    settings: dict[str, int | float | bool | str] = option(
+        {}, "further settings of the architecture by name: { depth = 3 }"
     )
-    settings: dict[str, int | float | bool | str] = Field(
-        default_factory=dict, description="further settings of the architecture by name: { depth = 3 }"
-    )
-    physics: dict[str, float] = Field(
-        default_factory=dict,
-        description="weights in the loss of energy, residual and data (1): { energy = 0.1 }; empty: the data alone",
+    physics: dict[str, float] = option(
+        {},
+        "weights in the loss of energy, residual and data (1): { energy = 0.1 }; empty: the data alone",
     )
 
 
-class DoubtSection(_Section):
-    """What the organ may be otherwise than its twin: `softtwin doubt` draws alternatives, and margins know of them."""
+class ModelErrorSection(Section):
+    """The model-error ensemble: `softtwin model-error` solves perturbed models of the organ, for the margins."""
 
-    draws: int = Field(96, ge=0, description="alternatives that are drawn, one under a training load each; 0: none")
-    attachment: float = Field(
+    group: ClassVar[str] = "model error"
+
+    draws: int = option(96, "perturbed models that are drawn, one under a training load each; 0: none", ge=0)
+    attachment: float = option(
         0.004,
+        "standard deviation, along each axis, of where on the organ the attachment lies",
+        unit="metres",
         ge=0.0,
-        description="how far what holds the organ may lie elsewhere on it: standard deviation along each axis, metres",
     )
-    poisson_ratio: tuple[float, float] | tuple[()] = Field(
-        (), description="least and largest Poisson's ratio that the organ may have; empty: the material's"
+    poisson_ratio: tuple[float, float] | tuple[()] = option(
+        (), "minimum and maximum of the Poisson's ratio that the organ may have; empty: the material's"
     )
-    meshes: int = Field(
-        0, ge=0, description="other meshes of the organ's surface, of half to twice as many nodes; 0: the twin's own"
+    meshes: int = option(
+        0, "other meshes of the organ's surface, of half to twice as many nodes; 0: the twin's own", ge=0
     )
-    seed: int = Field(0, ge=0, description="seed of the draws")
+    seed: int = option(0, "seed of the draws", ge=0)
 
     @property
     def is_asked_for(self) -> bool:
-        """Whether anything may be otherwise, and is drawn."""
+        """Whether any perturbed model is to be drawn."""
         return bool(self.draws and (self.attachment or self.poisson_ratio or self.meshes))
 
 
-class RegistrationSection(_Section):
+class RegistrationSection(Section):
     """From a cloud to forces."""
 
-    model: Literal["surrogate", "reference", "hybrid"] = Field(
-        "surrogate", description="which forward model registers; hybrid: the surrogate first, the reference from there"
+    group: ClassVar[str] = "solver"
+
+    model: Literal["surrogate", "reference", "hybrid"] = option(
+        "surrogate",
+        "which forward model registers; hybrid: the surrogate first, the reference from there",
+        basic=True,
+        old=("engine",),
     )
-    zone: str = Field("", description="zone whose nodes may carry force; empty: all loaded nodes")
-    noise: Positive = Field(5e-4, description="noise of a point, metres, that the search for it begins with")
-    noise_known: bool = Field(False, description="hold the noise at that value instead of finding it")
-    force_scale: float = Field(
-        0.0, ge=0.0, description="nodal force to begin with, newtons; 0: by stiffness and mesh; its size is found"
+    zone: str = option("", "zone whose nodes may carry force; empty: all loaded nodes", group="forces")
+    noise: float = option(
+        5e-4,
+        "standard deviation of a point's noise that its estimation begins with",
+        unit="metres",
+        gt=0.0,
+        group="noise",
+        basic=True,
     )
-    smoothness: float = Field(0.02, ge=0.0, description="correlation length of neighbouring forces, metres; 0: none")
-    directions: Count = Field(64, description="most directions of force kept: those that a cloud tells best")
-    points: Count = Field(1000, description="most points of a cloud used: larger ones are thinned")
-    distance: Literal["surface", "plane"] = Field(
-        "surface", description="of points to the surface, or to the planes of its triangles, along which they slide"
+    noise_known: bool = option(False, "keep the noise at that value instead of estimating it", group="noise")
+    force_scale: float = option(
+        0.0,
+        "nodal force that the estimation of its size begins with; 0: by stiffness and mesh",
+        unit="newtons",
+        ge=0.0,
+        group="forces",
     )
-    normals: bool = Field(False, description="clouds carry the normals of the surface seen, which pull, too")
-    normal_deviation: Positive = Field(10.0, description="standard deviation of a normal across itself, degrees")
-    budget: float = Field(0.0, ge=0.0, description="seconds for a frame, after which the best so far is taken; 0: none")
-    rounds: int = Field(
+    smoothness: float = option(
+        0.02, "correlation length of neighbouring forces; 0: none", unit="metres", ge=0.0, group="forces"
+    )
+    directions: int = option(
+        64, "maximum number of directions of force kept: the likelihood-informed ones", ge=1, group="forces"
+    )
+    points: int = option(1000, "maximum number of a cloud's points used: larger clouds are thinned", ge=1)
+    distance: Literal["surface", "plane"] = option(
+        "surface", "of points to the surface, or to the planes of its triangles, along which they slide"
+    )
+    normals: bool = option(
+        False, "read the normals in the clouds' files and fit the surface's normals to them, too", group="input"
+    )
+    normal_deviation: float = option(
+        10.0, "standard deviation of such a normal across itself", unit="degrees", gt=0.0, group="noise"
+    )
+    budget: float = option(
+        0.0, "time for a frame, after which the best so far is taken; 0: no limit", unit="seconds", ge=0.0
+    )
+    reweighting_rounds: int = option(
         -1,
+        "reweighting rounds of the sparse force localisation at a cold start; -1: as the model and zone ask",
         ge=-1,
-        description="how often a cold start gathers the forces where it has found some; -1: as the model and zone ask",
+        group="forces",
+        old=("rounds",),
     )
-    solver: Literal["gauss-newton", "l-bfgs"] = Field("gauss-newton", description="how the objective is minimised")
-    penalty: Literal["prior", "amplitude", "divergence"] = Field(
+    solver: Literal["gauss-newton", "l-bfgs"] = option("gauss-newton", "how the objective is minimised")
+    penalty: Literal["prior", "amplitude", "divergence"] = option(
         "prior",
-        description="what forces cost: by their Gaussian prior, or by l-bfgs with their size (Odot 2023, eq. 6.5) or "
-        "squared divergence (6.6) over the surface in its place",
+        "what forces cost: by their Gaussian prior, or by l-bfgs with their size (Odot 2023, eq. 6.5) or squared "
+        "divergence (6.6) over the surface in its place",
+        group="forces",
     )
-    alpha: float = Field(0.1, ge=0.0, le=1.0, description="weight of such a penalty beside the distances")
-    max_iterations: int = Field(
-        0, ge=0, description="most iterations; 0: what the solver is content with (gauss-newton 40, l-bfgs 200 a run)"
+    alpha: float = option(0.1, "weight of such a penalty beside the distances", ge=0.0, le=1.0, group="forces")
+    max_iterations: int = option(
+        0, "maximum number of iterations; 0: the solver's own (gauss-newton 40, l-bfgs 200 a run)", ge=0
     )
-    pose: Literal["auto", "fixed", "unknown"] = Field(
+    pose: Literal["auto", "fixed", "unknown"] = option(
         "auto",
-        description="whether the camera's pose is an unknown beside the forces; auto: where a start is given, and else "
-        "the clouds are in the organ's coordinates, as well as known_turn and known_shift say",
+        "whether the camera's pose is estimated with the forces; auto: where a start is given, and else the clouds are "
+        "in the organ's coordinates, as well as known_rotation and known_translation say",
+        group="pose",
     )
-    forces: Literal["unknown", "known"] = Field(
-        "unknown", description="known: none beside known_forces, gravity and pressure; the unknowns are to be found"
+    forces: Literal["unknown", "known"] = option(
+        "unknown",
+        "known: none beside known_forces, gravity and pressure; the parameters are to be found",
+        group="forces",
     )
-    unknowns: tuple[str, ...] = Field((), description=f"unknowns beside the forces: {UNKNOWNS}")
-    known_forces: str = Field("", description="known nodal forces: .npy (n, 3), newtons, on the axes of the files")
-    gravity: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0), description="that acts beyond what the body has at rest, m/s^2, on the axes of the files"
+    parameters: tuple[str, ...] = option(
+        (),
+        f"parameter to estimate beside the forces: {PARAMETERS}",
+        group="parameters",
+        flag="--parameter",
+        old=("unknowns", "unknown"),
     )
-    pressure: float = Field(0.0, description="on the whole boundary, pascals, following it (pneumoperitoneum)")
-    pose_turn: Positive = Field(5.0, description="how far an unknown pose may turn from its start, degrees")
-    pose_shift: Positive = Field(0.01, description="how far an unknown pose may shift from its start, metres")
-    known_turn: float = Field(
+    known_forces: str = option(
+        "", "known nodal forces: .npy (n, 3), on the axes of the files", unit="newtons", group="forces", exists=True
+    )
+    gravity: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0),
+        "gravity beyond what acts on the undeformed body, on the axes of the files",
+        unit="m/s^2",
+        group="forces",
+    )
+    pressure: float = option(
+        0.0, "pressure on the whole boundary, following it (pneumoperitoneum)", unit="pascals", group="forces"
+    )
+    pose_rotation: float = option(
+        5.0,
+        "prior standard deviation of an unknown pose's rotation from its start",
+        unit="degrees",
+        gt=0.0,
+        group="pose",
+        old=("pose_turn",),
+    )
+    pose_translation: float = option(
+        0.01,
+        "prior standard deviation of an unknown pose's translation from its start",
+        unit="metres",
+        gt=0.0,
+        group="pose",
+        old=("pose_shift",),
+    )
+    known_rotation: float = option(
         1.0,
+        "standard deviation of the rotation of a pose that is not estimated; 0: known exactly",
+        unit="degrees",
         ge=0.0,
-        allow_inf_nan=False,
-        description="how well a pose that is not asked for is known, degrees; 0: exactly",
+        group="pose",
+        old=("known_turn",),
     )
-    known_shift: float = Field(
+    known_translation: float = option(
         0.002,
+        "standard deviation of the translation of a pose that is not estimated; a correction counts as displacement",
+        unit="metres",
         ge=0.0,
-        allow_inf_nan=False,
-        description="the same of its shift, metres; what it is found to be off by counts as displacement",
+        group="pose",
+        old=("known_shift",),
     )
-    landmark_deviation: Positive = Field(
-        0.002, description="standard deviation of where landmarks were found that pull beside the clouds, metres"
+    landmark_deviation: float = option(
+        0.002,
+        "standard deviation of where the landmarks of each frame were found",
+        unit="metres",
+        gt=0.0,
+        group="noise",
     )
-    output_frame: Literal["lps", "ras", "source"] = Field(
-        "lps", description="axes of what is written; source: of the organ's files"
+    output_frame: Literal["lps", "ras", "source"] = option(
+        "lps", "axes of what is written; source: of the organ's files", group="output"
     )
-    output_unit: Literal["mm", "m", "source"] = Field(
-        "mm", description="unit of what is written; source: of the organ's files (nrrd, mrk.json and seq.mrb: mm)"
+    output_unit: Literal["mm", "m", "source"] = option(
+        "mm", "unit of what is written; source: of the organ's files (nrrd, mrk.json and seq.mrb: mm)", group="output"
     )
-    voxel: float = Field(
-        0.0, ge=0.0, description="edge of a voxel of a displacement field (nrrd), metres; 0: 64 along the organ"
+    voxel: float = option(
+        0.0,
+        "edge of a voxel of a displacement field (nrrd); 0: 64 along the organ",
+        unit="metres",
+        ge=0.0,
+        group="output",
     )
-    target_points: int = Field(
-        0, ge=0, description="points of the surface of each inner structure in mrk.json, beside its centre"
+    target_points: int = option(
+        0, "points of the surface of each inner structure in mrk.json, beside its centre", ge=0, group="output"
     )
 
     @model_validator(mode="after")
-    def _unknowns_can_be_found(self) -> RegistrationSection:
-        kinds = [Unknown.parse(text).kind for text in self.unknowns]
+    def _parameters_can_be_found(self) -> RegistrationSection:
+        kinds = [NamedParameter.parse(text).kind for text in self.parameters]
         others = set(kinds) - {"contact"}
         if "contact" in kinds and len(kinds) > 1:
-            raise ValueError(f"registration.unknowns: expected contact alone, got {', '.join(self.unknowns)}")
+            raise ValueError(f"registration.parameters: expected contact alone, got {', '.join(self.parameters)}")
         models = ["surrogate", "reference"] if kinds and not others else ["surrogate", "reference", "hybrid"]
         if others:  # a network has learned one material
             models = ["reference", "hybrid"]
@@ -324,29 +416,29 @@ class RegistrationSection(_Section):
             models = ["reference"]  # a network has one support, and no load inside or that follows the surface
         if self.model not in models:
             raise ValueError(
-                f"registration.model: expected {' or '.join(models)} with these unknowns and known loads (a network "
+                f"registration.model: expected {' or '.join(models)} with these parameters and known loads (a network "
                 f"has learned one material, one support and forces alone), got {self.model}"
             )
         if self.forces == "known" and not others:
             raise ValueError(
-                "registration.unknowns: expected at least one (young-modulus, poisson-ratio, moved@NODES) where all "
+                "registration.parameters: expected at least one (young-modulus, poisson-ratio, moved@NODES) where all "
                 "forces are known, got none"
             )
         return self
 
 
-class Config(_Section):
+class Config(Section):
     """One twin, from its surface to its registrations."""
 
-    folder: str = Field("twin-run", description="folder of everything that is made, relative to this file")
-    body: BodySection = BodySection()
-    material: MaterialSection = MaterialSection()
-    loads: LoadsSection = LoadsSection()
-    samples: SamplesSection = SamplesSection()
-    solver: SolverSection = SolverSection()
-    training: TrainingSection = TrainingSection()
-    doubt: DoubtSection = DoubtSection()
-    registration: RegistrationSection = RegistrationSection()
+    folder: str = option("twin-run", "folder of everything that is made, relative to this file")
+    body: BodySection = part(BodySection)
+    material: MaterialSection = part(MaterialSection)
+    loads: LoadsSection = part(LoadsSection)
+    samples: SamplesSection = part(SamplesSection)
+    solver: SolverSection = part(SolverSection)
+    training: TrainingSection = part(TrainingSection)
+    model_error: ModelErrorSection = part(ModelErrorSection, old=("doubt",))
+    registration: RegistrationSection = part(RegistrationSection)
 
     @property
     def wants_jacobians(self) -> bool:
@@ -419,15 +511,8 @@ def parse_config(entries: dict[str, Any], source: str = "configuration") -> Conf
     try:
         return Config.model_validate(entries)
     except ValidationError as error:
-        lines = [f"  {_described(item)}" for item in error.errors()]
+        lines = [f"  {described(Config, item)}" for item in error.errors()]
         raise ConfigError("\n".join([f"{source}: {len(lines)} wrong entries", *lines])) from None
-
-
-def _described(item: Any) -> str:
-    message = item["msg"].removeprefix("Value error, ")
-    if isinstance(item["input"], dict | BaseModel):  # of a whole section: the message names the entry and what came
-        return message
-    return f"{'.'.join(map(str, item['loc'])) or 'configuration'}: {message}, got {reprlib.repr(item['input'])}"
 
 
 def to_toml(config: Config) -> str:
@@ -440,25 +525,30 @@ def to_toml(config: Config) -> str:
             document.add(name, tomlkit.item(value).comment(field.description or ""))
     for name in type(config).model_fields:
         value = getattr(config, name)
-        if isinstance(value, BaseModel):
+        if isinstance(value, Section):
             document.add(tomlkit.nl())
             document.add(name, _table(value))
     return tomlkit.dumps(document)
 
 
-def _table(section: BaseModel) -> Any:
+def _comment(section: type[Section], name: str) -> str:
+    entry = option_of(section, name)
+    return f"{entry.meaning} [{entry.allowed}]" if entry.allowed else entry.meaning
+
+
+def _table(section: Section) -> Any:
     table = tomlkit.table()
     table.comment((type(section).__doc__ or "").strip())
     subtables = {}
-    for name, field in type(section).model_fields.items():
+    for name in type(section).model_fields:
         value = getattr(section, name)
         if isinstance(value, dict):
             subtables[name] = value
             continue
         item = tomlkit.item(list(value) if isinstance(value, tuple) else value)
-        table.add(name, item.comment(field.description or ""))
+        table.add(name, item.comment(_comment(type(section), name)))
     for name, value in subtables.items():
         inner = tomlkit.inline_table()
         inner.update(value)
-        table.add(name, inner.comment(type(section).model_fields[name].description or ""))
+        table.add(name, inner.comment(_comment(type(section), name)))
     return table

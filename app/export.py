@@ -182,9 +182,9 @@ class Exporter:
 
 def _check_voxel(twin: Twin) -> None:
     """Refuse voxels of which there would be too many; a deformed organ may be twice as long as at rest."""
-    from softtwin.meshes.displacement import MOST_VOXELS  # pynrrd, which is missed before the first frame
+    from softtwin.meshes.displacement import MAXIMUM_VOXELS  # pynrrd, which is missed before the first frame
 
-    least = 2.0 * float(np.ptp(twin.body.points, axis=0).max()) / MOST_VOXELS
+    least = 2.0 * float(np.ptp(twin.body.points, axis=0).max()) / MAXIMUM_VOXELS
     edge = twin.config.registration.voxel
     if 0.0 < edge < least:
         raise ConfigError(f"registration.voxel: expected 0 or at least {least:.2g} m for this organ, got {edge:g} m.")

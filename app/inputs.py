@@ -53,7 +53,7 @@ def plan_entries(config: Config) -> dict[str, Any]:
             **({"active": samples.rounds * samples.chosen} if samples.rounds else {}),
         },
         "block": samples.block,
-        "ramp": samples.ramp,
+        "ramp": samples.load_path,
         "seed": samples.seed,
         "newton": config.solver.model_dump(),
     }
@@ -84,9 +84,9 @@ def train_inputs(space: Workspace, data: DataSet) -> dict[str, Any]:
     return {"body.vtu": _sha256(space.body), "data set": data.identity, **training}
 
 
-def doubt_inputs(space: Workspace, data: DataSet) -> dict[str, Any]:
-    """Entries of [doubt] and the identity of the data set."""
-    return {"data set": data.identity, **dict(_flat("doubt", space.config.doubt.model_dump()))}
+def model_error_inputs(space: Workspace, data: DataSet) -> dict[str, Any]:
+    """Entries of [model_error] and the identity of the data set."""
+    return {"data set": data.identity, **dict(_flat("model_error", space.config.model_error.model_dump()))}
 
 
 def validate_inputs(space: Workspace, data: DataSet) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import FileError
-from softtwin.registration.marks import Marks
+from softtwin.registration.landmarks import LandmarkPairs
 from softtwin.registration.pose import LandmarkFit, from_landmarks, read_landmarks
 
 from .config import ConfigError
@@ -81,15 +81,15 @@ class MarkFiles:
         found = cls(_read(body, inside), camera, clouds)
         if not camera.is_dir() and (files is None or len(files) != 1):
             raise ConfigError(
-                f"--marks: expected a folder with a file for each cloud, named like it, got the file {camera} for "
-                f"{'clouds that are yet to come' if files is None else f'{len(files)} clouds'}."
+                f"--frame-landmarks: expected a folder with a file for each cloud, named like it, got the file "
+                f"{camera} for {'clouds that are yet to come' if files is None else f'{len(files)} clouds'}."
             )
         if files is None:
             return found
         if not [file for file in files if found.of(file) is not None]:  # every file is read
             raise ConfigError(
-                f"--marks: expected files in {camera} that are named like the clouds, such as {files[0].stem}.csv "
-                f"({', '.join(SUFFIXES)}), found none."
+                f"--frame-landmarks: expected files in {camera} that are named like the clouds, such as "
+                f"{files[0].stem}.csv ({', '.join(SUFFIXES)}), found none."
             )
         return found
 
@@ -104,9 +104,9 @@ class MarkFiles:
         """
         points = np.array(list(self.body.values()))
         try:
-            Marks.of(twin.observed, points, points)
+            LandmarkPairs.of(twin.observed, points, points)
         except ValueError as error:
-            raise ConfigError(f"--marks: {error}") from None
+            raise ConfigError(f"--frame-landmarks: {error}") from None
 
     def of(self, cloud: Path) -> tuple[Floats, Floats] | None:
         """Points on the body at rest and where a cloud's frame shows them, (l, 3) each, metres; None: it has no file.

@@ -14,8 +14,8 @@ from softtwin.reference.ranks import FailedElsewhere
 
 from .doctor import available_cores
 from .installation import launcher
-from .stages.doubt import doubt_stage
 from .stages.generate import generate_stage
+from .stages.model_error import model_error_stage
 
 REFUSED = 2  # exit code of a command whose message was printed
 _JOB_VARIABLES = ("PMIX_", "ORTE_", "OMPI_MCA_orte", "OMPI_MCA_ess", "OMPI_COMM_", "OMPI_UNIVERSE", "OMPI_APP_CTX")
@@ -37,15 +37,15 @@ def generate_in_parallel(config_path: Path, ranks: int, again: bool = False) -> 
         generate_stage(config_path, again=again)
 
 
-def doubt_in_parallel(config_path: Path, ranks: int) -> None:
-    """Run the stage of doubt under mpirun, or here where there is one core or no mpirun; as `generate_in_parallel`.
+def model_error_in_parallel(config_path: Path, ranks: int) -> None:
+    """Run the model-error stage under mpirun, or here where there is one core or no mpirun; as `generate_in_parallel`.
 
     Args:
         config_path: the configuration file.
         ranks: MPI ranks; 0 for one a core.
     """
-    if not _in_parallel(["doubt", str(config_path)], ranks):
-        click.echo(f"    {doubt_stage(config_path)}")
+    if not _in_parallel(["model-error", str(config_path)], ranks):
+        click.echo(f"    {model_error_stage(config_path)}")
 
 
 def _in_parallel(words: Sequence[str], ranks: int) -> bool:

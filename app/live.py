@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,37 +11,16 @@ import numpy as np
 
 from softtwin.meshes.files import Axes, Unit
 
+from .address import Address
+from .answer import Answer, Reply
 from .config import ConfigError
 from .export import WRITTEN, Exporter
 from .landmarks import MarkFiles
 from .record import Recorder, counts, describe
 from .register import Scene, Start, check_any, check_budget, name_of, registered, say_coordinates
-from .sources import Address, check_idle, opened
+from .sources import check_idle, opened
 from .streams import Clock, Mailbox
-from .twin import Camera, Frame, Sequence, Twin
-
-
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """A frame, and how it kept up with the camera.
-
-    Args:
-        frame: the frame.
-        cloud: name of its file, or what its sender calls it; empty for points without a name.
-        age: from the cloud's coming to the answer, seconds.
-        dropped: clouds that came and went unregistered since the frame before.
-        is_late: whether the age is more than was allowed.
-    """
-
-    frame: Frame
-    cloud: str
-    age: float
-    dropped: int
-    is_late: bool
-
-
-Reply = Callable[[Answer, Mapping[str, Any]], None]
-"""What is given each answer, and its figures as they stand in the record."""
+from .twin import Camera, Sequence, Twin
 
 
 def answers(
@@ -175,7 +153,9 @@ def watch_source(
     start = start or Start()
     marks = scene.marks(start)
     if marks is not None and isinstance(source, Address):
-        raise ConfigError(f"--marks: expected clouds in files, which marks go with by their names, got {source}.")
+        raise ConfigError(
+            f"--frame-landmarks: expected clouds in files, which marks go with by their names, got {source}."
+        )
     with scene.opened(start, say) as (twin, camera):
         say_coordinates(twin, say)
         twin.registrar()  # prepared before the first cloud is waited for

@@ -16,7 +16,7 @@ import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,11 +26,9 @@ from softtwin.meshes.body import Surface
 from softtwin.meshes.export import Coordinates
 from softtwin.registration.result import Registration
 
+from .answer import Answer
 from .record import NOTICE, finite
 from .twin import Twin
-
-if TYPE_CHECKING:
-    from .live import Answer
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

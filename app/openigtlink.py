@@ -19,8 +19,8 @@ from contextlib import suppress
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
 
+from .address import Address
 from .messages import HEADER_SIZE, Header, MessageError, cloud_in
-from .sources import Address
 from .streams import Clock, Mailbox
 
 LIMIT = 64 * 2**20  # bytes of a body; two hundred thousand points are 27 MB as POINT

@@ -53,7 +53,7 @@ def quickstart_config(small: bool) -> Config:
             "loads": loads,
             "samples": {"train": 192, "validation": 24, "test": 32, "calibration": 32},
             "training": {"seconds": 25.0, "width": 128},
-            "doubt": {"draws": 32},
+            "model_error": {"draws": 32},
         }
     )
 

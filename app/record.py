@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.metrics import target_errors
-from softtwin.registration.conditions import WITHIN_90
+from softtwin.registration.parameter_blocks import WITHIN_90
 from softtwin.registration.pose import Pose
 from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Verdict
@@ -120,7 +120,7 @@ def _header(twin: Twin, zone: str | None) -> dict[str, Any]:
     options = section.model_dump() | ({} if zone is None else {"zone": zone})
     return {
         "notice": NOTICE,
-        "format": 3,
+        "format": 4,
         "body": twin.body.fingerprint,
         "files_in": {"unit": place.unit, "axes": place.axes},
         "figures_in": {"unit": "m", "axes": place.axes},
@@ -128,7 +128,7 @@ def _header(twin: Twin, zone: str | None) -> dict[str, Any]:
         "source_in": {"unit": own.unit, "axes": own.axes},
         "notes": notes_on(twin),
         "options": options,
-        **({"doubt": dict(twin.otherwise)} if twin.otherwise else {}),
+        **({"model_error": dict(twin.model_error)} if twin.model_error else {}),
     }
 
 
@@ -156,37 +156,37 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
     """
     place = twin.written_in
     turned = place.directions(np.eye(3))
-    net, doubt = place.directions(result.net_force), result.net_force_deviation
+    net, deviation = place.directions(result.net_force), result.net_force_deviation
     row: dict[str, Any] = {
         "outcome": result.outcome.name.lower(),
         "rms_distance_m": result.rms_distance,
         "noise_m": result.noise,
         "net_force_N": net.tolist(),
-        "net_force_deviation_N": doubt.tolist(),
-        "net_force_90_N": np.stack([net - WITHIN_90 * doubt, net + WITHIN_90 * doubt], axis=1).tolist(),
+        "net_force_deviation_N": deviation.tolist(),
+        "net_force_90_N": np.stack([net - WITHIN_90 * deviation, net + WITHIN_90 * deviation], axis=1).tolist(),
         "net_force_covariance_N2": (turned @ result.net_force_covariance @ turned).tolist(),
         "force_scale_N": result.force_scale,
         "largest_displacement_m": float(np.linalg.norm(result.displacement, axis=1).max()),
-        "model_doubt": result.doubt,
+        "discrepancy_scale": result.discrepancy_scale,
         "largest_correction_m": float(np.linalg.norm(result.correction, axis=1).max()),
         "pose": twin.coordinates.motion(result.pose.matrix).tolist(),
         "points": result.points,
-        "points_alike": result.alike,
+        "points_alike": result.inflation_factor,
         "outliers": result.outliers,
         "informed": result.informed,
         "iterations": len(result.trace),
         "evaluations": result.evaluations,
         "solve_seconds": result.seconds,
     }
-    askew = askew_of(result)
-    if askew is not None:
-        row["askew"] = askew
+    correction = pose_correction_of(result)
+    if correction is not None:
+        row["pose_correction"] = correction
     shared = result.problem.correlated
     if shared is not None:
         row["shared_noise"] = {"size_m": shared.size, "length_m": shared.length}
     if result.estimates:
         row["estimates"] = [asdict(estimate) for estimate in result.estimates]
-    if doubt.any():  # there are unknown forces
+    if deviation.any():  # there are unknown forces
         ratio, deviation = _over_modulus(twin, result)
         row["net_force_over_modulus_m2"] = place.directions(ratio).tolist()
         row["net_force_over_modulus_deviation_m2"] = deviation.tolist()
@@ -224,14 +224,14 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
     return row
 
 
-def askew_of(result: Registration) -> dict[str, Any] | None:
+def pose_correction_of(result: Registration) -> dict[str, Any] | None:
     """What a pose that was said to be known is off by, SI units; None for one that is exact, or unknown altogether."""
     pose = result.problem.pose
     if pose is None or not pose.is_said:
         return None
     return {
-        "turn_rad": result.askew.angle_to(Pose.identity()),
-        "shift_m": float(np.linalg.norm(result.askew.apply(pose.centre) - pose.centre)),
+        "rotation_rad": result.pose_correction.angle_to(Pose.identity()),
+        "translation_m": float(np.linalg.norm(result.pose_correction.apply(pose.centre) - pose.centre)),
         "chance": result.chance_of_pose,
         "is_seen": result.chance_of_pose < _ASKEW,
     }
@@ -240,7 +240,7 @@ def askew_of(result: Registration) -> dict[str, Any] | None:
 def _over_modulus(twin: Twin, result: Registration) -> tuple[Floats, Floats]:
     """Net force over Young's modulus, (3,), square metres, and its deviation: by the configuration's where it is known.
 
-    How well that modulus is known is doubt of the newtons, and none of this.
+    How well that modulus is known adds to the uncertainty of the newtons, and is no part of this.
     """
     if result.force_over_modulus is not None:
         return result.force_over_modulus
@@ -268,23 +268,26 @@ def finite(value: Any) -> Any:
 
 
 def describe(row: Mapping[str, Any]) -> str:
-    """One line for a person: the verdict with its first reason, distance, net force with its doubt, errors if known."""
+    """One line for a person: the verdict with its first reason, distance, net force, errors if known."""
     line = f"frame {row['frame']:3d}: {row['verdict']}"
     if row["reasons"]:
         line += f" ({row['reasons'][0]})"
     if "net_force_N" not in row:
         return line
-    force, doubt = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
+    force, deviation = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
     line += f", cloud to surface {millimetres(row['rms_distance_m'])}"
     if "shared_noise" in row:
         size, length = (row["shared_noise"][name] for name in ("size_m", "length_m"))
         line += f", of which neighbours within {millimetres(length, 0)} share noise of {millimetres(size)}"
-    if row.get("askew", {}).get("is_seen"):
-        shift, turn = millimetres(row["askew"]["shift_m"]), np.rad2deg(row["askew"]["turn_rad"])
+    if row.get("pose_correction", {}).get("is_seen"):
+        shift, turn = (
+            millimetres(row["pose_correction"]["translation_m"]),
+            np.rad2deg(row["pose_correction"]["rotation_rad"]),
+        )
         line += f", pose {shift} and {turn:.1f} degrees from where it was said"
     line += f", {row['landmarks']} landmarks" if "landmarks" in row else ""
     line += (
-        f", net force {force:.3f} ± {doubt:.3f} N" if force > 0.0 or doubt > 0.0 else ""
+        f", net force {force:.3f} ± {deviation:.3f} N" if force > 0.0 or deviation > 0.0 else ""
     )  # none where all forces are known
     line += f", {row['informed']:.0f} directions seen" if math.isfinite(row.get("informed", math.nan)) else ""
     line += "".join(f", {describe_estimate(estimate)}" for estimate in row.get("estimates", ()))
@@ -307,7 +310,7 @@ def describe_estimate(estimate: Mapping[str, Any]) -> str:
     if unit == "m":
         value, low, high, unit = 1e3 * value, 1e3 * low, 1e3 * high, "mm"
     text = f"{estimate['name']} {_plain(value)}{' ' + unit if unit else ''} ({_plain(low)} to {_plain(high)})"
-    return text if estimate["told"] > _TOLD else f"{text}, not told by the cloud"
+    return text if estimate["variance_reduction"] > _TOLD else f"{text}, not told by the cloud"
 
 
 def _plain(value: float) -> str:

@@ -21,16 +21,18 @@ from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import Axes, ContentError, FileError, Unit, read_cloud
 from softtwin.registration.pose import Pose, read_matrix
-from softtwin.registration.unknowns import PosePrior
+from softtwin.registration.priors import PosePrior
 
 from . import twin as twins
+from .arguments import RegisterArguments
 from .config import ConfigError
 from .export import WRITTEN, Exporter
 from .landmarks import MarkFiles, camera_from_landmarks, describe_landmarks
+from .parameters import priors_taken
 from .record import NOTICE as NOTICE
 from .record import Recorder, counts, describe, notes_on
+from .schema import option_of
 from .twin import Camera, Frame, Twin, coordinates_of
-from .unknowns import priors_taken
 
 Floats = NDArray[np.float64]
 CLOUDS = (".npy", ".txt", ".csv", ".xyz", ".ply", ".stl", ".obj", ".vtk", ".vtp", ".vtu", ".pcd")
@@ -290,7 +292,7 @@ class Scene:
             ConfigError, FileError, PoseError, TwinError: what cannot be used, and why.
         """
         section = twins.with_options(self.home.config, dict(self.options)).registration
-        for line in priors_taken(section.unknowns) if section.forces == "unknown" else ():
+        for line in priors_taken(section.parameters) if section.forces == "unknown" else ():
             say(line)
         pose = None
         if start.matrix is not None:
@@ -378,8 +380,7 @@ def check_budget(budget: float | None) -> None:
     Raises:
         ConfigError: they are not.
     """
-    if budget is not None and not 0.0 < budget < math.inf:
-        raise ConfigError(f"--budget: expected a positive time in seconds, got {budget}.")
+    option_of(RegisterArguments, "budget").check(budget, "--budget")
 
 
 def check_any(rows: Sequence[Mapping[str, Any]]) -> None:

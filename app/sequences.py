@@ -72,7 +72,7 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
         "rows": shown,
         "unlisted": len(rows) - len(shown),
         "targets": list(body.inner),
-        "doubt": _otherwise(record.get("doubt", {})),
+        "model_error": _model_error(record.get("model_error", record.get("doubt", {}))),
         "drafted": any("draft" in row for row in rows),
         "estimates": lambda row: [describe_estimate(estimate) for estimate in row.get("estimates", ())],
         "together": [describe_estimate(estimate) for estimate in record.get("together", ())],
@@ -96,14 +96,14 @@ def _coordinates(record: Mapping[str, Any]) -> str:
     )
 
 
-def _otherwise(asked: Mapping[str, Any]) -> str:
-    """What margins know that the organ may be otherwise, in words; none where they know of nothing."""
+def _model_error(asked: Mapping[str, Any]) -> str:
+    """What the model-error ensemble behind the margins perturbs, in words; none where there is no ensemble."""
     words = []
     if asked.get("attachment"):
         words.append(f"an attachment that lies elsewhere by some {1e3 * asked['attachment']:.1f} mm along each axis")
     if asked.get("poisson_ratio"):
-        least, largest = asked["poisson_ratio"]
-        words.append(f"a Poisson's ratio of {least:g} to {largest:g}")
+        minimum, maximum = asked["poisson_ratio"]
+        words.append(f"a Poisson's ratio of {minimum:g} to {maximum:g}")
     if asked.get("meshes"):
         words.append(f"{asked['meshes']} other meshes of its surface")
     return " and ".join(words)
@@ -196,8 +196,8 @@ def _draw(sheet: Figure, rows: Sequence[Mapping[str, Any]]) -> None:
     found = [row for row in rows if "net_force_N" in row]
     frames = [row["frame"] for row in found]
     force = [float(np.linalg.norm(row["net_force_N"])) for row in found]
-    doubt = [float(np.linalg.norm(row["net_force_deviation_N"])) for row in found]
-    left.errorbar(frames, force, doubt, fmt="none", ecolor="#8a929c", elinewidth=1)
+    deviations = [float(np.linalg.norm(row["net_force_deviation_N"])) for row in found]
+    left.errorbar(frames, force, deviations, fmt="none", ecolor="#8a929c", elinewidth=1)
     for axes, values in ((left, force), (right, [1e3 * (row["noise_m"] or np.nan) for row in found])):
         axes.scatter(frames, values, s=20, c=[_COLOURS[row["verdict"]] for row in found], zorder=3)
         for row in rows:

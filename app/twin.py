@@ -23,30 +23,31 @@ from softtwin.reference.data.discrepancy import Discrepancy, read_discrepancy
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import loaded_nodes
 from softtwin.registration.cloud import Cloud, turned
-from softtwin.registration.conditions import Conditions
 from softtwin.registration.contact import ContactRegistrar
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.hybrid import HybridRegistrar
+from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.landmarks import LandmarkPairs
 from softtwin.registration.lbfgs import LBFGS
-from softtwin.registration.marks import Marks
 from softtwin.registration.options import NOISE, RegistrationOptions, expected_force, options_for
+from softtwin.registration.parameter_blocks import ParameterBlocks
 from softtwin.registration.penalties import PENALTIES
 from softtwin.registration.pose import Pose
+from softtwin.registration.priors import PosePrior
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.result import Registration
 from softtwin.registration.rigid import align
-from softtwin.registration.unknowns import PosePrior
 from softtwin.registration.verdict import Judgement, Verdict
 
 from .config import Config, ConfigError, RegistrationSection, files_axes, parse_config
 from .inputs import check_material, load_plan
-from .unknowns import Scenario, UnknownError
+from .parameters import ParameterError
+from .scenario import Scenario
 from .workspace import open_workspace
 
 if TYPE_CHECKING:
-    from softtwin.surrogate.certificate import Certificate, Certifier
+    from softtwin.surrogate.error_bound import ErrorBound, ErrorEstimator
     from softtwin.surrogate.loaded import LoadedSurrogate
     from softtwin.surrogate.model import Surrogate, SurrogateState
 
@@ -54,11 +55,12 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 Engine = Registrar | HybridRegistrar | ContactRegistrar
-DOUBT = "doubt.npz"  # in a twin: what its organ may be otherwise
+MODEL_ERROR = "model_error.npz"  # in a twin: covariance of its model-error ensemble
+FORMER_MODEL_ERROR = "doubt.npz"  # the name of that file before
 Camera = Pose | PosePrior | Literal["align"] | None
 """Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
 is first looked for in the clouds themselves, None for clouds in the coordinates of the body at rest, as well as the
-configuration's `known_turn` and `known_shift` say."""
+configuration's `known_rotation` and `known_translation` say."""
 
 
 Landmarks = tuple[ArrayLike, ArrayLike]
@@ -97,7 +99,7 @@ class Twin:
         config: settings; `config.registration` says how clouds are registered.
         resources: what is given back when the twin is closed.
         fast: a faster model of the same body, which registers first (the hybrid engine); None for the model alone.
-        otherwise: what the organ may be otherwise, as `softtwin doubt` was asked; empty where it was not.
+        model_error: what the model-error ensemble perturbs, as `softtwin model-error` was asked; empty without one.
     """
 
     def __init__(
@@ -106,9 +108,9 @@ class Twin:
         config: Config | None = None,
         resources: ExitStack | None = None,
         fast: ForwardModel | None = None,
-        otherwise: Mapping[str, Any] = MappingProxyType({}),
+        model_error: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
-        self.otherwise = otherwise
+        self.model_error = model_error
         self._model: ForwardModel | None = model
         self._fast = fast
         self._body = model.body
@@ -181,7 +183,7 @@ class Twin:
         """
         return self.model.solve(forces)
 
-    def certify(self, forces: ArrayLike, state: SurrogateState | None = None, newton: bool = False) -> Certificate:
+    def bound_error(self, forces: ArrayLike, state: SurrogateState | None = None, newton: bool = False) -> ErrorBound:
         """How wrong the network's displacement under nodal forces may be, and whether that may be relied upon.
 
         Args:
@@ -193,9 +195,9 @@ class Twin:
         Raises:
             CalibrationError: the model is no network, or it was never calibrated.
         """
-        return self._certifier.certify(forces, state, newton)
+        return self._certifier.bound_error(forces, state, newton)
 
-    def bounded(self, found: Registration) -> Certificate | None:
+    def bounded(self, found: Registration) -> ErrorBound | None:
         """How wrong the network may be about a registered state; None where there is none that was calibrated.
 
         Of the hybrid engine it is about what the network had found.
@@ -204,18 +206,18 @@ class Twin:
             found: a registration of this twin.
         """
         card: Any = getattr(self._fast or self.model, "card", {})
-        return self._certifier.certify((found.draft or found).forces) if card.get("certificate") else None
+        return self._certifier.bound_error((found.draft or found).forces) if card.get("certificate") else None
 
     @cached_property
-    def _certifier(self) -> Certifier:
-        from softtwin.surrogate.certificate import Certifier  # torch is needed here alone
+    def _certifier(self) -> ErrorEstimator:
+        from softtwin.surrogate.error_bound import ErrorEstimator  # torch is needed here alone
+        from softtwin.surrogate.error_indicators import CalibrationError
         from softtwin.surrogate.model import Surrogate
-        from softtwin.surrogate.signs import CalibrationError
 
         network = self._fast or self.model
         if not isinstance(network, Surrogate):
-            raise CalibrationError(f"Twin.certify: expected a twin with a network, got {type(network).__name__}.")
-        return Certifier(network)
+            raise CalibrationError(f"Twin.bound_error: expected a twin with a network, got {type(network).__name__}.")
+        return ErrorEstimator(network)
 
     def register(
         self,
@@ -293,7 +295,7 @@ class Twin:
         if isinstance(camera, Pose) and places.ndim == 2 and places.shape[1] == 3:
             places = camera.inverse().apply(places)
         wide = self.config.registration.landmark_deviation if deviation is None else deviation
-        return registrar.marked(Marks.of(registrar.observed, landmarks[0], places, wide))
+        return registrar.with_landmarks(LandmarkPairs.of(registrar.observed, landmarks[0], places, wide))
 
     @property
     def observed(self) -> SurfaceDistance:
@@ -380,7 +382,7 @@ class Twin:
     def near(self, pose: Pose) -> PosePrior:
         """An unknown pose about an expected one, with the deviations of the configuration."""
         options = self.config.registration
-        return PosePrior(pose, self._middle, np.deg2rad(options.pose_turn), options.pose_shift)
+        return PosePrior(pose, self._middle, np.deg2rad(options.pose_rotation), options.pose_translation)
 
     @cached_property
     def as_said(self) -> PosePrior | None:
@@ -391,10 +393,10 @@ class Twin:
         options = self.config.registration
         if options.pose == "unknown":
             return self.near(Pose.identity())
-        turn, shift = np.deg2rad(options.known_turn), options.known_shift
-        if options.pose == "fixed" or options.forces == "known" or 0.0 in (turn, shift):
+        rotation, translation = np.deg2rad(options.known_rotation), options.known_translation
+        if options.pose == "fixed" or options.forces == "known" or 0.0 in (rotation, translation):
             return None
-        return PosePrior(Pose.identity(), self._middle, turn, shift, is_said=True)
+        return PosePrior(Pose.identity(), self._middle, rotation, translation, is_said=True)
 
     @property
     def _middle(self) -> Floats:
@@ -442,15 +444,15 @@ class Twin:
             return ContactRegistrar(exact, patch)
         return exact if self._fast is None else HybridRegistrar(self._alone(self._fast, zone), exact)
 
-    def _conditions(self, model: ForwardModel) -> Conditions | None:
+    def _conditions(self, model: ForwardModel) -> ParameterBlocks | None:
         """Unknowns beside the forces, for the model that takes them."""
         if model is self._fast:
             return None
         material = self.config.material
         try:
-            return Scenario.of(self.config).conditions(self.body, material.young_modulus, material.poisson_ratio)
+            return Scenario.of(self.config).parameter_blocks(self.body, material.young_modulus, material.poisson_ratio)
         except ValueError as error:
-            raise ConfigError(f"registration.unknowns: {error}") from None
+            raise ConfigError(f"registration.parameters: {error}") from None
 
     def _alone(self, model: ForwardModel, zone: str) -> Registrar:
         body, section = self.body, self.config.registration
@@ -458,8 +460,8 @@ class Twin:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
         loaded = loaded_nodes(body, load_plan(self.config))
         nodes = None if section.forces == "known" else body.node_sets[zone] if zone else loaded
-        conditions = self._conditions(model)
-        if nodes is not None and conditions is not None and not len(np.setdiff1d(nodes, conditions.moved)):
+        parameter_blocks = self._conditions(model)
+        if nodes is not None and parameter_blocks is not None and not len(np.setdiff1d(nodes, parameter_blocks.moved)):
             raise ConfigError(
                 f"registration.zone: expected nodes that may carry force, got {zone or 'loaded nodes'}, all of which "
                 "moved@ holds; what is moved carries none. Give another zone."
@@ -472,7 +474,7 @@ class Twin:
             smoothness=section.smoothness,
             directions=section.directions,
             options=_options(section, options_for(model, bool(zone))),
-            conditions=conditions,
+            parameter_blocks=parameter_blocks,
             modulus_deviation=self.config.material.young_modulus_deviation,
             elsewhere=loaded if zone else None,
         )
@@ -544,7 +546,7 @@ def _takes_marks(registrar: Engine) -> Registrar | HybridRegistrar:
 
 def _options(section: RegistrationSection, suited: RegistrationOptions) -> RegistrationOptions:
     spread = 0.0 if section.noise_known else NOISE.spread
-    noise = Scale(section.noise, spread, least=min(NOISE.least, section.noise))
+    noise = LogNormalPrior(section.noise, spread, minimum=min(NOISE.minimum, section.noise))
     solver = suited.solver
     if section.penalty != "prior":
         solver = LBFGS(penalty=PENALTIES[section.penalty](section.alpha))
@@ -552,15 +554,15 @@ def _options(section: RegistrationSection, suited: RegistrationOptions) -> Regis
         solver = LBFGS()
     if section.max_iterations:
         solver = replace(solver, max_iterations=section.max_iterations)
-    gathering = suited.gathering
-    if section.rounds >= 0:
-        gathering = replace(gathering, rounds=section.rounds)
+    localisation = suited.localisation
+    if section.reweighting_rounds >= 0:
+        localisation = replace(localisation, rounds=section.reweighting_rounds)
     return replace(
         suited,
         noise=noise,
         solver=solver,
-        most_points=section.points,
-        gathering=gathering,
+        maximum_points=section.points,
+        localisation=localisation,
         distance=section.distance,
         normal_deviation=float(np.deg2rad(section.normal_deviation)),
     )
@@ -601,7 +603,7 @@ class Home:
         config = with_options(self.config, {**options, **({"model": model} if model else {})})
         with ExitStack() as opened:
             both = opened.enter_context(forward_models(config.registration.model, self.folder, self.body, config))
-            known = known_doubt(self.folder, self.body, config)
+            known = known_model_error(self.folder, self.body, config)
             return Twin(both[0], config, opened.pop_all(), both[1], {} if known is None else known[1])
 
 
@@ -649,7 +651,7 @@ def forward_models(
         ConfigError: there is no surrogate.
         ValueError: a surrogate of another material than the configuration's.
     """
-    network, known = None, known_doubt(folder, body, config)
+    network, known = None, known_model_error(folder, body, config)
     further = None if known is None else known[0]
     if name != "reference":
         if not (folder / "surrogate.json").is_file():
@@ -676,11 +678,11 @@ def forward_models(
     strange = sorted(scenario.held.keys() - body.node_sets.keys())
     if strange:
         raise ConfigError(
-            f"registration.unknowns: expected moved@ one of {sorted(body.node_sets)}, got {strange[0]!r}."
+            f"registration.parameters: expected moved@ one of {sorted(body.node_sets)}, got {strange[0]!r}."
         )
     try:
         loading = scenario.loading(body, coordinates_of(config))
-    except UnknownError as error:
+    except ParameterError as error:
         raise ConfigError(f"registration.known_forces: {error}") from None
     fast: Surrogate | LoadedSurrogate | None = network
     if network is not None and loading.forces is not None:
@@ -702,20 +704,20 @@ def _loaded(network: Surrogate, known: ArrayLike) -> LoadedSurrogate:
         raise ConfigError(f"registration.known_forces: {error} Register with the reference engine.") from None
 
 
-def known_doubt(folder: Path, body: Body, config: Config) -> tuple[Discrepancy, dict[str, Any]] | None:
-    """What `softtwin doubt` found that a twin's organ may be otherwise, and was asked; None where it was not.
+def known_model_error(folder: Path, body: Body, config: Config) -> tuple[Discrepancy, dict[str, Any]] | None:
+    """What `softtwin model-error` found for a twin, and what it was asked; None where it has not run.
 
     Raises:
         ConfigError: it was found for another law of material.
         DiscrepancyError: the file cannot be used.
     """
-    file = folder / DOUBT
+    file = next((folder / name for name in (MODEL_ERROR, FORMER_MODEL_ERROR) if (folder / name).is_file()), folder)
     if not file.is_file():
         return None
     found, made_of = read_discrepancy(file, body)
     if made_of.get("material") != config.material.law:
         raise ConfigError(
             f"{file}: made for the material {made_of.get('material')!r}, and material.law is {config.material.law!r}; "
-            "make it again with `softtwin doubt`."
+            "make it again with `softtwin model-error`."
         )
     return found, made_of

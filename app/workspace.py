@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -127,7 +128,15 @@ def read_records(folder: Path) -> dict[str, dict[str, Any]]:
     except (OSError, ValueError):
         return {}
     entries = found.items() if isinstance(found, dict) else ()
-    return {name: entry for name, entry in entries if _is_record(entry)}
+    return dict(_renamed(name, entry) for name, entry in entries if _is_record(entry))
+
+
+def _renamed(name: str, entry: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """A stage and its record under today's words: what is unchanged need not be made again."""
+    if name != "doubt":
+        return name, entry
+    read = {re.sub(r"^doubt\.", "model_error.", what): value for what, value in entry.get("read", {}).items()}
+    return "model_error", {**entry, "read": read}
 
 
 def write_whole(path: Path, content: str) -> None:

@@ -1,6 +1,6 @@
 """Draws that active rounds choose against random ones: error at the 95 % quantile by the number of training draws.
 
-    python benchmarks/active_rounds.py [--loads modal ranges] [--seconds 120] [--epochs 24] [--ranks 2]
+    python benchmarks/active_rounds.py [--only modal ...] [--seconds 120] [--epochs 24] [--ranks 2]
 
 The small beam (304 hexahedra) under the loads of table 4.2 (`modal`) and under loads of all sizes up to 0.4 m
 (`ranges`). Random: 4,096 training draws. Active: 512 random ones, then six rounds of 256 that are chosen from 16 times
@@ -11,17 +11,15 @@ each and judged on the random set's 2,000 held-out draws.
 
 from __future__ import annotations
 
-import argparse
 from typing import Any
 
 import numpy as np
-from networks import AMPLITUDES, RUNS
-from record import recorded, write
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
+from made import beam_data
+from networks import AMPLITUDES
+from record import RUNS
 
-from softtwin.app.chain import prepare
-from softtwin.app.config import Config
-from softtwin.app.launch import generate_in_parallel
-from softtwin.app.stages.mesh import mesh_stage
 from softtwin.meshes.metrics import nodal_distances, relative_error
 from softtwin.reference.data.dataset import DataSet, existing
 from softtwin.surrogate.model import Surrogate
@@ -29,7 +27,6 @@ from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
 
-NAME = "active_rounds"
 LOADS = {
     "modal": {"amplitude": AMPLITUDES["modal"], "patches": 1, "radius": (0.055, 0.64)},
     "ranges": {"displacement": 0.4, "patches": 1, "radius": (0.055, 0.64)},
@@ -47,16 +44,11 @@ def data_of(loads: str, is_active: bool, seconds: float, ranks: int) -> DataSet:
     own = {"train": FIRST, "rounds": ROUNDS, "chosen": CHOSEN, "candidates": CANDIDATES, "test": 16}
     samples = own if is_active else {"train": RANDOM, "test": TEST}
     entries = {
-        "folder": ".",
-        "body": {"source": "beam"},
         "loads": LOADS[loads],
         "samples": {**samples, "validation": 256, "block": 16, "ranks": ranks, "jacobians": False},
         "training": {"seconds": seconds},
     }
-    space = prepare(Config.model_validate(entries), folder)
-    mesh_stage(space)
-    generate_in_parallel(folder / "organ.toml", ranks)
-    return DataSet(space.data)
+    return beam_data(folder, entries, ranks)
 
 
 def judged(surrogate: Surrogate, data: DataSet) -> dict[str, Any]:
@@ -78,39 +70,47 @@ def judged(surrogate: Surrogate, data: DataSet) -> dict[str, Any]:
 _SHARES = {"median": 0.5, "p95": 0.95, "p99": 0.99}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--loads", nargs="+", default=list(LOADS), choices=list(LOADS))
-    parser.add_argument("--seconds", type=float, default=120.0, help="four times those of a round's network")
-    parser.add_argument("--epochs", type=int, default=24, help="of 4,096 draws; the steps are the same for fewer")
-    parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found = recorded(arguments.name)
-    for loads in arguments.loads:
-        sets = {
-            kind: data_of(loads, kind == "active", arguments.seconds, arguments.ranks) for kind in ("random", "active")
-        }
-        rows = [
-            (kind, count) for count in (512, 1024, 2048, RANDOM) for kind in sets if kind == "random" or count < RANDOM
-        ]
-        for kind, count in rows:
-            key, data = f"{loads}: {kind}, {count} draws", sets[kind]
-            if key not in found:
-                epochs = arguments.epochs * RANDOM // count
-                surrogate = train(data, TrainingPlan(Reduced(), epochs=epochs, samples=count))
-                counts = surrogate.card["samples"]
-                found[key] = {"draws": count, "accepted": counts["train"], "rejected": counts["rejected"]}
-                found[key] |= {"steps": surrogate.card["training"]["steps"], **judged(surrogate, sets["random"])}
-                write(arguments.name, found)
-            row, nodal = found[key], found[key]["nodal_error_m"]
-            print(
-                f"{key:30} {row['accepted']} accepted; mean {1e3 * nodal['mean']:.4f}, 95 % {1e3 * nodal['p95']:.4f}, "
-                f"99 % {1e3 * nodal['p99']:.4f} mm; relative {100 * row['relative_error']['median']:.3f} "
-                f"(95 % {100 * row['relative_error']['p95']:.3f}) %",
-                flush=True,
-            )
+ROWS = {
+    f"{loads}: {kind}, {count} draws": (loads, kind, count)
+    for loads in LOADS
+    for count in (512, 1024, 2048, RANDOM)
+    for kind in ("random", "active")
+    if kind == "random" or count < RANDOM
+}
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    loads, kind, count = ROWS[row]
+    data, random = (
+        given.once(data_of, loads, each == "active", given.seconds, given.ranks) for each in (kind, "random")
+    )
+    surrogate = train(data, TrainingPlan(Reduced(), epochs=given.epochs * RANDOM // count, samples=count))
+    counts = surrogate.card["samples"]
+    found = {"draws": count, "accepted": counts["train"], "rejected": counts["rejected"]}
+    return {**found, "steps": surrogate.card["training"]["steps"], **judged(surrogate, random)}
+
+
+BENCHMARK = Benchmark(
+    name="active_rounds",
+    title="Draws that active rounds choose against random ones, by the number of training draws",
+    about=("surrogate", "reference", "app/stages"),
+    work=work,
+    rows=tuple(ROWS),
+    columns=(
+        Column(
+            "mean; 95 %; 99 %",
+            "mm",
+            "{nodal_error_m.mean*1000:.3f}; {nodal_error_m.p95*1000:.3f}; {nodal_error_m.p99*1000:.3f}",
+        ),
+        Column("relative, median (95 %)", "%", "{relative_error.median*100:.3f} ({relative_error.p95*100:.2f})"),
+    ),
+    settings={
+        "seconds": Setting(120.0, "four times those of a round's network"),
+        "epochs": Setting(24, "of 4,096 draws; the steps are the same for fewer"),
+        "ranks": RANKS,
+    },
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -10,18 +10,18 @@ what one would find that knew which point of the cloud is which of the organ. Th
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from liver import SEQUENCES, liver, sequence
 from numpy.typing import NDArray
-from record import stamp, write
 from scipy.spatial.transform import Rotation
-from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.body import Surface
 from softtwin.meshes.clouds import visible_triangles
@@ -110,52 +110,77 @@ def impossible(draw: Callable[[np.random.Generator], Floats], surface: Surface, 
     return {"draws": draws, "found": float(np.mean([a.is_found for a in alignments])), "outcomes": outcomes(alignments)}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=40)
-    parser.add_argument("--wild", type=int, default=40, help="draws with outliers; half as many of each wrong cloud")
-    parser.add_argument("--name", default="alignment", help="of the record")
-    arguments = parser.parse_args()
-    draws = arguments.draws
-    body, phantom = liver(), liver_phantom()
-    frames = np.concatenate([sequence(name).positions for name in SEQUENCES])
-    surface = body.boundary_surface
+def of_share(kind: str, share: float, draws: int, wild: int) -> dict[str, Any]:
+    """Views of the organ that show a share of it, as they are or with outliers."""
+    views = [seen(share, np.random.default_rng([1, i])) for i in range(draws if kind == "liver" else min(draws, wild))]
+    clouds = [v.cloud for v in views]
+    if kind == "outliers":
+        clouds = [with_outliers(cloud, np.random.default_rng([2, i])) for i, cloud in enumerate(clouds)]
+    return of_liver(organ().boundary_surface, views, clouds)
 
-    def seen(share: float, rng: np.random.Generator) -> View:
-        return view(body.points, frames[rng.integers(len(frames))], body.boundary, share, rng)
 
-    def other(share: float) -> Callable[[np.random.Generator], Floats]:
-        return lambda rng: view(phantom.points, phantom.points, phantom.boundary, share, rng).cloud
+organ, phantom = cache(liver), cache(liver_phantom)
 
-    def mirrored(share: float) -> Callable[[np.random.Generator], Floats]:
-        return lambda rng: seen(share, rng).cloud * np.array([-1.0, 1.0, 1.0])
 
-    def line(rng: np.random.Generator) -> Floats:
-        return np.outer(rng.uniform(-0.1, 0.1, POINTS), rng.normal(size=3)) + NOISE * rng.normal(size=(POINTS, 3))
+@cache
+def frames() -> Floats:
+    """True positions of all sequences."""
+    return np.concatenate([sequence(name).positions for name in SEQUENCES])
 
-    def plane(rng: np.random.Generator) -> Floats:
-        return rng.uniform(-0.05, 0.05, (POINTS, 3)) * [1, 1, 0] + NOISE * rng.normal(size=(POINTS, 3))
 
-    def box(rng: np.random.Generator) -> Floats:
-        return rng.uniform(-0.1, 0.1, (POINTS, 3))
+def seen(share: float, rng: np.random.Generator) -> View:
+    """A view of the organ in one of its frames."""
+    return view(organ().points, frames()[rng.integers(len(frames()))], organ().boundary, share, rng)
 
-    figures: dict[str, Any] = {"points": POINTS, "noise_m": NOISE, "liver": {}, "outliers": {}, "impossible": {}}
-    with threadpool_limits(1):
-        for share in SHARES:
-            views = [seen(share, np.random.default_rng([1, i])) for i in range(draws)]
-            few = views[: arguments.wild]
-            wild = [with_outliers(v.cloud, np.random.default_rng([2, i])) for i, v in enumerate(few)]
-            for kind, seen_as, clouds in (("liver", views, [v.cloud for v in views]), ("outliers", few, wild)):
-                figures[kind][f"{share:.0%}"] = row = of_liver(surface, seen_as, clouds)
-                print(f"{kind:9} {share:4.0%}", {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()},
-                      flush=True)  # fmt: skip
-        cases = {f"mirrored {share:.0%}": mirrored(share) for share in SHARES}
-        cases |= {f"another organ {share:.0%}": other(share) for share in SHARES}
-        for name, draw in (cases | {"line": line, "plane": plane, "box": box}).items():
-            figures["impossible"][name] = row = impossible(draw, surface, max(1, arguments.wild // 2))
-            print(f"{name:18}", row, flush=True)
-    write(arguments.name, {**figures, "made": stamp()})
+
+def other(share: float, rng: np.random.Generator) -> Floats:
+    """A cloud of another organ."""
+    return view(phantom().points, phantom().points, phantom().boundary, share, rng).cloud
+
+
+IMPOSSIBLE: dict[str, Callable[[np.random.Generator], Floats]] = {
+    **{f"mirrored {s:.0%}": lambda rng, s=s: seen(s, rng).cloud * np.array([-1.0, 1.0, 1.0]) for s in SHARES},
+    **{f"another organ {s:.0%}": partial(other, s) for s in SHARES},
+    "line": lambda rng: (
+        np.outer(rng.uniform(-0.1, 0.1, POINTS), rng.normal(size=3)) + NOISE * rng.normal(size=(POINTS, 3))
+    ),
+    "plane": lambda rng: rng.uniform(-0.05, 0.05, (POINTS, 3)) * [1, 1, 0] + NOISE * rng.normal(size=(POINTS, 3)),
+    "box": lambda rng: rng.uniform(-0.1, 0.1, (POINTS, 3)),
+}
+KINDS = {f"{kind} {share:.0%}": (kind, share) for share in SHARES for kind in ("liver", "outliers")}
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    if row in IMPOSSIBLE:
+        return impossible(IMPOSSIBLE[row], organ().boundary_surface, max(1, given.wild // 2))
+    return of_share(*KINDS[row], given.draws, given.wild)
+
+
+BENCHMARK = Benchmark(
+    name="alignment",
+    title="A rigid start found from a partial cloud alone: how often, how near, how often wrong unsaid",
+    about=("registration/rigid.py", "registration/pose.py", "meshes"),
+    work=work,
+    rows=(*KINDS, *IMPOSSIBLE),
+    columns=(
+        Column("draws", "", "{draws}"),
+        Column("found", "%", "{found*100:.1f}"),
+        Column("found within 15 mm", "%", "{found_within_15_mm*100:.1f}"),
+        Column("at best within 15 mm", "%", "{matched_within_15_mm*100:.1f}"),
+        Column("found, beyond 30; 50 mm", "%", "{found_beyond_30_mm*100:.1f}; {found_beyond_50_mm*100:.1f}"),
+        Column("median error of those found", "mm", "{median_error_of_found_m*1000:.1f}"),
+        Column("median", "s", "{seconds_median:.2f}"),
+    ),
+    settings={
+        "draws": Setting(40, "of each row"),
+        "wild": Setting(40, "draws with outliers; half as many of each wrong cloud"),
+    },
+    seeds=(1, 2, 3),
+    small={"draws": 2, "wild": 2},
+    under="rows",
+    finish=lambda figures, given: {"points": POINTS, "noise_m": NOISE},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

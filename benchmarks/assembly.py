@@ -5,16 +5,14 @@ Assembly: summed from the cells against DOLFINx's own, time and difference. Fact
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from columns import Column
+from harness import Benchmark, Setting, run
 from liver import POISSON_RATIO, YOUNG_MODULUS, liver
-from record import write
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
@@ -24,8 +22,6 @@ from softtwin.reference.fem.fenicsx import assemble_matrix, create_matrix
 from softtwin.reference.fem.forms import DiscreteLoad, Forms
 from softtwin.reference.solve.linear import LinearSolver
 
-REPEATS = 15
-
 
 def seconds(call: Callable[[], Any]) -> float:
     begin = time.perf_counter()
@@ -33,7 +29,7 @@ def seconds(call: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def compare(body: Body) -> dict[str, Any]:
+def compare(body: Body, repeats: int) -> dict[str, Any]:
     space = Discretisation(body, False, {"fixed": "xyz"})
     forms = Forms(space, NeoHookean(YOUNG_MODULUS, POISSON_RATIO))
     state = 1e-5 * body.size * np.random.default_rng(0).standard_normal(space.owned)
@@ -45,12 +41,12 @@ def compare(body: Body) -> dict[str, Any]:
             seconds(lambda: forms.tangent(state, load, mine)),
             seconds(lambda: assemble_matrix(theirs, forms.tangent_form, space.conditions)),
         )
-        for _ in range(REPEATS)
+        for _ in range(repeats)
     ]
     ours, dolfinx = np.median(pairs, axis=0)
     suited, mumps = LinearSolver(mine, space, "band"), LinearSolver(theirs, space, "mumps")
     factors = []
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         mine.stateIncrease()
         theirs.stateIncrease()
         factors.append((seconds(suited.prepare), seconds(mumps.prepare)))
@@ -66,13 +62,26 @@ def compare(body: Body) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    bodies = {"beam": beam(), "liver": liver(), "large beam": beam((39, 9, 9), (100.0, 25.0, 25.0))}
-    figures = {name: compare(body) for name, body in bodies.items()}
-    for name, row in figures.items():
-        print(name, row)
-    write("assembly", figures)
+BODIES = {"beam": beam, "liver": liver, "large beam": lambda: beam((39, 9, 9), (100.0, 25.0, 25.0))}
+BENCHMARK = Benchmark(
+    name="assembly",
+    title="What an iteration pays for its tangent: assembly and factorisation against DOLFINx's and MUMPS's",
+    about=("reference/fem", "reference/solve"),
+    work=lambda row, given: compare(BODIES[row](), given.repeats),
+    rows=tuple(BODIES),
+    columns=(
+        Column("unknowns", "", "{unknowns:,}"),
+        Column("summed from the cells", "ms", "{summed_ms:.1f}"),
+        Column("DOLFINx", "ms", "{dolfinx_ms:.1f}"),
+        Column("factored", "ms", "{factored_ms:.1f}"),
+        Column("MUMPS", "ms", "{mumps_ms:.1f}"),
+        Column("largest difference", "", "{largest_difference:.0e}"),
+    ),
+    settings={"repeats": Setting(15, "of each, in turn")},
+    seeds=(0,),
+    small={"repeats": 2},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

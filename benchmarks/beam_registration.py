@@ -13,7 +13,6 @@ The beam may be pushed into one place in several ways: cases whose surface is ma
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -21,15 +20,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+import made
 import numpy as np
 import torch
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from inverse import cloud_of
-from networks import RUNS
 from networks_bodies import case, data_of
 from numpy.typing import NDArray
-from record import recorded, write
+from record import RUNS
 from scipy.optimize import minimize
-from threadpoolctl import threadpool_limits
+from summaries import counts
 from tqdm import tqdm
 
 from softtwin.meshes.body import Body
@@ -38,8 +39,8 @@ from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import draw_load
 from softtwin.reference.solve.problem import Problem
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import expected_force, options_for
 from softtwin.registration.problem import Problem as Search
 from softtwin.registration.registrar import prepare
@@ -51,13 +52,11 @@ from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.residual import ElasticBody
 from softtwin.surrogate.train import train
-from softtwin.surrogate.twin import load as load_twin
-from softtwin.surrogate.twin import save
 
 Floats = NDArray[np.float64]
-NAME, BODY = "beam_registration", "beam-6.1"
+BODY = "beam-6.1"
 MODULUS, RATIO, POINTS = 4500.0, 0.49, 1000
-CLEAR = Scale(1e-4, 1.0, least=1e-5)  # metres: points without noise
+CLEAR = LogNormalPrior(1e-4, 1.0, minimum=1e-5)  # metres: points without noise
 KINDS = ("bending", "torsion", "both")
 FRESH = 1_000_000
 MATCHED, WRONG = (
@@ -124,10 +123,12 @@ def cases(data: DataSet, problem: Problem, count: int) -> Iterator[Case]:
 def network_of(data: DataSet, seconds: float) -> Surrogate:
     """The reduced network, trained once."""
     folder = RUNS / f"{BODY}-{seconds:g}s"
-    if not (folder / "surrogate.json").exists():
+
+    def learn() -> Surrogate:
         learned = train(data, TrainingPlan(Reduced(modes=64), seconds=seconds))
-        save(with_discrepancy(with_domain(learned, data), data), folder)
-    return load_twin(folder, data.body)
+        return with_discrepancy(with_domain(learned, data), data)
+
+    return made.network(folder, data.body, learn)
 
 
 class Clock:
@@ -245,7 +246,7 @@ def first_order(network: Surrogate) -> Way:
             match = observed.match(positions, given.cloud)
             full = np.zeros_like(body.points)
             full[observed.nodes] = (observed.rows(match).T @ match.distances).reshape(-1, 3) / len(given.cloud)
-            gradient = state.pull(full)[own].ravel()
+            gradient = state.vjp(full)[own].ravel()
             first[0] = first[0] or float(np.linalg.norm(gradient))
             if np.linalg.norm(gradient) <= _RELATIVE * first[0]:
                 kept[0] = coefficients.copy()
@@ -284,8 +285,7 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     wrong = [row["mean_m"] > WRONG for row in done]
     found["matched"] = float(np.mean(matched))
     found["matched_in_a_wrong_state"] = float(np.mean(np.logical_and(matched, wrong)))
-    verdicts = [row["verdict"] for row in done]
-    found["verdicts"] = {name: verdicts.count(name) for name in sorted(set(verdicts)) if name}
+    found["verdicts"] = counts(row["verdict"] for row in done)
     accepted = [row["mean_m"] for row in done if row["verdict"] == "accepted"]
     found["accepted_largest_mean_m"] = max(accepted, default=None)
     stress = [row["stress_off"] for row in done if row["stress_off"] is not None]
@@ -314,38 +314,67 @@ def judged(way: Way, given: Case, elastic: ElasticBody | None) -> dict[str, Any]
     return row
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=10_000, help="of all three kinds together")
-    parser.add_argument("--few", type=int, default=1000, help="cases of the ways that are slower")
-    parser.add_argument("--seconds", type=float, default=200.0, help="of training")
-    parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found, data = recorded(arguments.name), data_of(BODY, arguments.ranks, jacobians=True)
-    network = network_of(data, arguments.seconds)
-    elastic = ElasticBody(data.body, NeoHookean(MODULUS, RATIO)).double()
-    ways: dict[str, tuple[Way, int]] = {
-        "where forces act is known": (ours(network, True), arguments.cases),
-        "forces anywhere": (ours(network, False), arguments.few),
-        "L-BFGS, gradient 1e-4, no prior": (first_order(network), arguments.few),
-    }
-    wanted = {name: pair for name, pair in ways.items() if name not in found}
-    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in wanted}
-    clocks = {name: Clock() for name in wanted}
-    with threadpool_limits(1), Problem(data.body, NeoHookean(MODULUS, RATIO)) as problem:
-        for place, given in enumerate(tqdm(cases(data, problem, arguments.cases), total=arguments.cases, desc="cases")):
-            for name, (way, count) in wanted.items():
-                if place < count:
-                    with watched(clocks[name]):
-                        rows[name].append(judged(way, given, elastic if place < STRESSED else None))
-            if (place + 1) % 1000 == 0 or place + 1 == arguments.cases:
-                for name, each in rows.items():
-                    kinds = {kind: figures_of([row for row in each if row["kind"] == kind]) for kind in KINDS}
-                    found[name] = {**figures_of(each), "kinds": kinds, "seconds_in": dict(clocks[name].spent)}
-                write(arguments.name, found)
-    print(found)
+SLOW = "L-BFGS, gradient 1e-4, no prior"
+WAYS: dict[str, Callable[[Surrogate], Way]] = {
+    "where forces act is known": lambda network: ours(network, True),
+    "forces anywhere": lambda network: ours(network, False),
+    SLOW: first_order,
+}
+
+
+@contextmanager
+def solved(ranks: int, count: int) -> Iterator[list[Case]]:
+    """So many cases."""
+    data = data_of(BODY, ranks, jacobians=True)
+    with Problem(data.body, NeoHookean(MODULUS, RATIO)) as problem:
+        yield list(tqdm(cases(data, problem, count), total=count, desc="cases"))
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    data = given.once(data_of, BODY, given.ranks, True)
+    way = WAYS[row](given.once(network_of, data, given.seconds))
+    elastic, clock, rows = ElasticBody(data.body, NeoHookean(MODULUS, RATIO)).double(), Clock(), []
+    few = given.cases if row == next(iter(WAYS)) else given.few
+    for place, one in enumerate(tqdm(given.opened(solved, given.ranks, given.cases)[:few], desc=row)):
+        with watched(clock):
+            rows.append(judged(way, one, elastic if place < STRESSED else None))
+    kinds = {kind: figures_of([each for each in rows if each["kind"] == kind]) for kind in KINDS}
+    return {**figures_of(rows), "kinds": kinds, "seconds_in": dict(clock.spent)}
+
+
+def lines(rows: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A line for each way, and for each kind of load."""
+    for way, whole in rows.items():
+        for kind, found in {"": whole, **whole["kinds"]}.items():
+            yield f"{way}{', ' if kind else ''}{kind}", found
+
+
+BENCHMARK = Benchmark(
+    name="beam_registration",
+    title="Registration of the thesis's beam with a network (table 6.1, figure 6.9), unseen cases",
+    about=("registration", "surrogate"),
+    work=work,
+    rows=tuple(WAYS),
+    columns=(
+        Column("cases; failed", "", lambda f: f"{f['cases']}; {len(f['failed'])}"),
+        Column("mean nodal", "mm", "{mean_m.mean*1000:.3f} +- {mean_m.deviation*1000:.3f}"),
+        Column("largest", "mm", "{largest_m.mean*1000:.2f} ({largest_m.most*1000:.1f})"),
+        Column("net force off, median", "%", "{force_off.median*100:.1f}"),
+        Column("stress off", "%", "{stress_off*100:.1f}"),
+        Column("iterations", "", "{iterations.mean:.0f} +- {iterations.deviation:.0f}"),
+        Column("time", "ms", "{ms.mean:.0f} +- {ms.deviation:.0f}"),
+        Column("matched; in a wrong state", "%", "{matched*100:.1f}; {matched_in_a_wrong_state*100:.1f}"),
+        Column("verdicts", "", lambda f: ", ".join(f"{count} {name}" for name, count in f["verdicts"].items()) or "-"),
+    ),
+    settings={
+        "cases": Setting(10_000, "of all three kinds together"),
+        "few": Setting(1000, "cases of the ways that are slower"),
+        "seconds": Setting(200.0, "of training"),
+        "ranks": RANKS,
+    },
+    lines=lines,
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

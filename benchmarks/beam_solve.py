@@ -6,12 +6,14 @@ python benchmarks/beam_solve.py
 from __future__ import annotations
 
 import time
+from functools import partial
+from typing import Any
 
 import numpy as np
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
-from record import write
 from scipy.optimize import brentq
-from threadpoolctl import threadpool_limits
+from summaries import median_seconds
 
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import NeoHookean
@@ -37,49 +39,52 @@ def deflection(problem: Problem, newtons: float) -> float:
     return float(np.linalg.norm(problem.solve(tip_load(problem, newtons)).displacement[tip].mean(axis=0)))
 
 
-def timed(problem: Problem, forces: NDArray[np.float64], repeats: int, stability: bool) -> float:
-    """Median wall time of a solve from rest, milliseconds."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        problem.solve(forces, stability=stability)
-        seconds.append(time.perf_counter() - begin)
-    return 1e3 * float(np.median(seconds))
-
-
-def main() -> None:
-    with threadpool_limits(1), Problem(beam(), NeoHookean(YOUNG_MODULUS, POISSON_RATIO)) as problem:
+def work(row: str, given: Given) -> dict[str, Any]:
+    with Problem(beam(), NeoHookean(YOUNG_MODULUS, POISSON_RATIO)) as problem:
         newtons = brentq(lambda f: deflection(problem, f) - WANTED, 0.5, 3.0, xtol=1e-4)
         forces = tip_load(problem, newtons)
         state = problem.solve(forces)
-        figures = {
+        return {
             "tip_force_N": newtons,
             "tip_deflection_m": deflection(problem, newtons),
             "iterations": state.iterations,
             "factorisations": state.factorisations,
-            "median_ms": timed(problem, forces, 50, stability=False),
-            "median_with_stability_ms": timed(problem, forces, 50, stability=True),
+            "median_ms": 1e3 * median_seconds(partial(problem.solve, forces, stability=False), given.repeats),
+            "median_with_stability_ms": 1e3
+            * median_seconds(partial(problem.solve, forces, stability=True), given.repeats),
+            "modal_loads": modal_loads(problem, given.loads),
         }
-        shapes = eigenmodes(problem, 10).shapes
-        rng = np.random.default_rng(0)
-        rows = []
-        for _ in range(100):
-            load = AMPLITUDE * draw_load(problem.body, shapes, LoadPlan(radius=(0.055, 0.64)), rng)
-            begin = time.perf_counter()
-            state = problem.solve(load, stability=False)
-            rows.append((1e3 * (time.perf_counter() - begin), state.iterations, state.factorisations, state.load_steps))
-        milliseconds, iterations, factorisations, steps = np.array(rows).T
-        figures["modal_loads"] = {
-            "count": len(rows),
-            "in_one_load_step": int((steps == 1).sum()),
-            "median_ms": float(np.median(milliseconds)),
-            "mean_ms": float(milliseconds.mean()),
-            "mean_iterations": float(iterations.mean()),
-            "mean_factorisations": float(factorisations.mean()),
-        }
-    print(figures)
-    write("beam_solve", figures)
+
+
+def modal_loads(problem: Problem, count: int) -> dict[str, float]:
+    """Times and counts of so many loads as data sets have them."""
+    shapes, rng, rows = eigenmodes(problem, 10).shapes, np.random.default_rng(0), []
+    for _ in range(count):
+        load = AMPLITUDE * draw_load(problem.body, shapes, LoadPlan(radius=(0.055, 0.64)), rng)
+        begin = time.perf_counter()
+        state = problem.solve(load, stability=False)
+        rows.append((1e3 * (time.perf_counter() - begin), state.iterations, state.factorisations, state.load_steps))
+    milliseconds, iterations, factorisations, steps = np.array(rows).T
+    return {
+        "count": len(rows),
+        "in_one_load_step": int((steps == 1).sum()),
+        "median_ms": float(np.median(milliseconds)),
+        "mean_ms": float(milliseconds.mean()),
+        "mean_iterations": float(iterations.mean()),
+        "mean_factorisations": float(factorisations.mean()),
+    }
+
+
+BENCHMARK = Benchmark(
+    name="beam_solve",
+    title="One equilibrium of the thesis's beam, bent by 0.3 m, and a hundred under modal loads",
+    about=("reference",),
+    work=work,
+    settings={"repeats": Setting(50, "of the timed solve"), "loads": Setting(100, "modal ones")},
+    seeds=(0,),
+    small={"repeats": 3, "loads": 5},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

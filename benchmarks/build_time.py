@@ -5,57 +5,48 @@ python benchmarks/build_time.py [--nodes 2000] [--samples 512] [--seconds 120]
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import time
-from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
+from harness import Benchmark, Given, Setting, run
 from liver import POISSON_RATIO, YOUNG_MODULUS, liver
-from record import write
+from record import RUNS
 
 from softtwin.app.cli import main as softtwin
 
-RUNS = Path(__file__).parent / "runs"
 
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--nodes", type=int, default=2000)
-    parser.add_argument("--samples", type=int, default=512)
-    parser.add_argument("--seconds", type=float, default=120.0)
-    arguments = parser.parse_args()
-    folder = RUNS / "build"
+def work(row: str, given: Given) -> dict[str, Any]:
+    folder, body = RUNS / "build", liver()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    body = liver()
     meshio.Mesh(1e3 * body.points, [("triangle", body.boundary)]).write(folder / "liver_mm.stl")
     np.savetxt(folder / "veins_mm.txt", 1e3 * body.points[body.fixed])
     np.savetxt(folder / "reach_mm.txt", 1e3 * body.points[body.node_sets["s1"]])
-    begin = time.perf_counter()
-    words = [
-        "build",
-        folder / "liver_mm.stl",
-        "--unit",
-        "mm",
-        "--fixed",
-        folder / "veins_mm.txt",
-        "--output",
-        folder / "out",
-    ]
+    out, begin = folder / "out", time.perf_counter()
+    words = ["build", folder / "liver_mm.stl", "--unit", "mm", "--fixed", folder / "veins_mm.txt", "--output", out]
     words += ["--zone", f"reach={folder / 'reach_mm.txt'}", "--displacement", 0.05, "--ramp", 8]
     words += ["--young-modulus", YOUNG_MODULUS, "--poisson-ratio", POISSON_RATIO]
-    words += ["--nodes", arguments.nodes, "--samples", arguments.samples, "--seconds", arguments.seconds]
+    words += ["--nodes", given.nodes, "--samples", given.samples, "--seconds", given.seconds]
     softtwin([str(word) for word in words])
     seconds = time.perf_counter() - begin
-    out = folder / "out"
     validation = json.loads((out / "validation.json").read_text())["figures"]
     stages = {name: entry["seconds"] for name, entry in json.loads((out / "stages.json").read_text()).items()}
-    print({"seconds": seconds, **stages})
-    write("build_time", {"asked": vars(arguments), "seconds": seconds, "stages": stages, "held_out": validation})
+    return {"asked": given.settings, "seconds": seconds, "stages": stages, "held_out": validation}
+
+
+BENCHMARK = Benchmark(
+    name="build_time",
+    title="From a surface file to a finished twin: the real liver's boundary as an STL in millimetres, by stage",
+    about=("app", "meshes", "reference", "surrogate"),
+    work=work,
+    settings={"nodes": Setting(2000), "samples": Setting(512), "seconds": Setting(120.0, "of training")},
+    small={"nodes": 300, "samples": 32, "seconds": 5.0},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -1,6 +1,6 @@
 """Is the doubt right where the model is? Truths drawn from the prior, a thousand cases on the beam and on the liver.
 
-    python benchmarks/calibration.py [--bodies beam liver ...] [--cases 1000] [--twin TWIN]
+    python benchmarks/calibration.py [--only liver ...] [--cases 1000] [--twin TWIN]
 
 Nodal forces are drawn from the prior that the registration has (smooth over a zone, their size log-normal about the one
 told), solved by the reference, and seen as a noisy cloud of 500 points of one side; the surrogate registers them from
@@ -17,7 +17,6 @@ seen (a quarter to all of it, in one piece), so that predicted errors differ by 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,13 +24,14 @@ from typing import Any
 
 import numpy as np
 from beam_registration import BODY, MODULUS, RATIO, network_of
+from columns import Column, shares, verdicts
+from harness import RANKS, Benchmark, Given, Setting, run
 from liver import POISSON_RATIO, YOUNG_MODULUS, liver
-from networks import RUNS
 from networks_bodies import data_of
 from numpy.typing import NDArray
-from record import recorded, stamp, write
+from record import RUNS
 from scipy.stats import chi2, norm
-from threadpoolctl import threadpool_limits
+from summaries import counts, predicted_mm
 from tqdm import tqdm
 
 from softtwin.meshes.body import Body, Surface
@@ -39,17 +39,16 @@ from softtwin.meshes.clouds import CloudError, sample
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.solve.problem import Problem
-from softtwin.registration.evidence import Scale
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import options_for
+from softtwin.registration.priors import nodal_forces
 from softtwin.registration.registrar import prepare
-from softtwin.registration.unknowns import nodal_forces
 from softtwin.registration.verdict import Verdict
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.twin import load as load_twin
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-NAME = "calibration"
 POINTS, SPREAD = 500, 0.5  # of the logarithm of the forces' size, as the product believes
 NOISES, COUNTS, SEEN = (3e-4, 3e-3), (100, 1000), (0.25, 1.0)  # of any camera: metres, points, share of the side
 SHARES = (0.5, 0.9, 0.95)
@@ -126,17 +125,17 @@ CASES: dict[str, Callable[[Path, int], Case]] = {
 
 def size_told(case: Case, body: Body) -> float:
     """Newtons for which forces of the prior move the body as far as is wanted, in the median, to first order."""
-    forces = nodal_forces(body, case.zone, Scale(1.0, SPREAD), case.smoothness)
+    forces = nodal_forces(body, case.zone, LogNormalPrior(1.0, SPREAD), case.smoothness)
     rng = np.random.default_rng(1)
     draws = forces.basis @ rng.standard_normal((forces.size, 50))
-    moved = case.network.solve(np.zeros_like(body.points)).push(draws).reshape(-1, 3, 50)
+    moved = case.network.solve(np.zeros_like(body.points)).jvp(draws).reshape(-1, 3, 50)
     return case.moved / float(np.median(np.linalg.norm(moved, axis=1).max(axis=0)))
 
 
-def run(case: Case, count: int) -> dict[str, Any]:
+def run_cases(case: Case, count: int) -> dict[str, Any]:
     """So many cases; a load without a stable equilibrium, or beyond what the network has learned, is drawn again."""
     body = case.network.body
-    scale = Scale(size_told(case, body), SPREAD, least=1e-6)
+    scale = LogNormalPrior(size_told(case, body), SPREAD, minimum=1e-6)
     drawn = nodal_forces(body, case.zone, scale, case.smoothness)
     registrar = prepare(
         case.network,
@@ -154,7 +153,7 @@ def run(case: Case, count: int) -> dict[str, Any]:
             number += 1
             size = scale.median * np.exp(SPREAD * rng.standard_normal())
             forces = drawn.forces(size * rng.standard_normal(drawn.size))
-            if (case.network.solve(forces).extent or 0.0) > 1.0:
+            if (case.network.solve(forces).extrapolation_ratio or 0.0) > 1.0:
                 again["beyond what was learned"] += 1
                 continue
             try:
@@ -183,7 +182,7 @@ def one(case: Case, registrar: Any, forces: Floats, truth: Floats, rng: np.rando
     return {
         "verdict": result.judgement.verdict.value,
         "error_mm": 1e3 * float(errors.mean()),
-        "predicted_mm": 1e3 * float(np.sqrt(8.0 / (3.0 * np.pi)) * known.deviation.mean()),
+        "predicted_mm": predicted_mm(known),
         "covered": [float((errors <= known.margin(None, share))[free].mean()) for share in SHARES],
         "z": np.linalg.solve(root, missed).tolist(),
         "ranks": norm.cdf(-missed / result.net_force_deviation).tolist(),
@@ -199,10 +198,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     errors, predicted = (np.array([row[name] for row in used]) for name in ("error_mm", "predicted_mm"))
     steps = np.arange(1, len(used) + 1) / len(used)
     apart = np.maximum(steps[:, None] - ranks, ranks - steps[:, None] + 1.0 / len(used)).max(axis=0)
-    verdicts = [row["verdict"] for row in rows]
     return {
         "cases": len(rows),
-        "verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))},
+        "verdicts": counts(row["verdict"] for row in rows),
         "error_mm": float(errors.mean()),
         "predicted_mm": float(predicted.mean()),
         "correlation": float(np.corrcoef(errors, predicted)[0, 1]),
@@ -217,22 +215,36 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bodies", nargs="+", default=list(CASES), choices=list(CASES))
-    parser.add_argument("--cases", type=int, default=1000)
-    parser.add_argument("--twin", type=Path, default=RUNS / "liver" / "twin")
-    parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found = recorded(arguments.name)
-    for body in arguments.bodies:
-        if body not in found:
-            with threadpool_limits(1):
-                found[body] = {**run(CASES[body](arguments.twin, arguments.ranks), arguments.cases), "made": stamp()}
-            write(arguments.name, found)
-        print(body, found[body], flush=True)
+def work(row: str, given: Given) -> dict[str, Any]:
+    return run_cases(CASES[row](given.twin, given.ranks), given.cases)
+
+
+BENCHMARK = Benchmark(
+    name="calibration",
+    title="Whether the posterior is right where the model is: truths drawn from the prior",
+    about=("registration", "surrogate", "reference"),
+    work=work,
+    rows=tuple(CASES),
+    columns=(
+        Column("accepted; doubtful; refused", "", verdicts),
+        Column("error; predicted", "mm", "{error_mm:.2f}; {predicted_mm:.2f}"),
+        Column("r", "", "{correlation:.2f}"),
+        Column("nodes covered by 50 / 90 / 95 % margins", "%", lambda f: shares(f["nodes"])),
+        Column("net force", "%", lambda f: shares(f["force"])),
+        Column("z: mean", "", lambda f: ", ".join(f"{z:.2f}" for z in f["z_mean"])),
+        Column("z: deviation", "", lambda f: ", ".join(f"{z:.2f}" for z in f["z_deviation"])),
+        Column("ranks apart", "", lambda f: ", ".join(f"{apart:.3f}" for apart in f["ranks_apart"])),
+        Column("envelope", "", "{envelope:.3f}"),
+        Column("median", "s", "{median_seconds:.2f}"),
+    ),
+    settings={
+        "cases": Setting(1000, "of each row"),
+        "twin": Setting(RUNS / "liver" / "twin", "that registration_surrogate.py makes", picks=True),
+        "ranks": RANKS,
+    },
+    small={"cases": 3},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -1,6 +1,6 @@
 """Bounds on errors that nobody has seen: how many keep them, how wide they are, what they cost, what is set aside.
 
-    python benchmarks/certificates.py [--seconds 200] [--ranks 2] [--stepped 400] [--bodies modal ranges ...]
+    python benchmarks/certificates.py [--seconds 200] [--ranks 2] [--stepped 400] [--only modal ...]
 
 The small beam under the loads of table 4.2 (`modal`) and under harder ones of all sizes (`ranges`): 2,500 loads to
 calibrate with and 2,500 to test on in each of four ranges of size; the real liver (`liver-tetrahedra`) with 1,000 and
@@ -10,35 +10,31 @@ and networks are made under benchmarks/runs/ where they are not there.
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import made
 import numpy as np
-from networks import RUNS
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from networks import data_of as small_data
 from networks_bodies import case, data_of
-from record import recorded, stamp, write
-from threadpoolctl import threadpool_limits
+from record import RUNS
 
 from softtwin.reference.data.dataset import DataSet, Split
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.generate import Plan, ramp_loads
 from softtwin.reference.solve.problem import Problem
 from softtwin.surrogate.calibration import calibrate, coverage, fitted_bounds, read_samples
-from softtwin.surrogate.certificate import ERRORS, Certifier, bound, range_of
 from softtwin.surrogate.domain import with_domain
+from softtwin.surrogate.error_bound import ERRORS, ErrorEstimator, bound, range_of
+from softtwin.surrogate.error_indicators import IndicatorReader
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
-from softtwin.surrogate.signs import SignReader
 from softtwin.surrogate.train import train
-from softtwin.surrogate.twin import load as load_twin
-from softtwin.surrogate.twin import save
 
-NAME = "certificates"
 FRESH = 1_000_000  # numbers of loads begin here: none of them is in a data set
 FAR, TIMED, STEPPED = 1000, 100, 400  # loads three times too large; predictions that are timed; Newton's steps
 POOLED: tuple[Split, ...] = ("calibration", "test")
@@ -48,16 +44,18 @@ SPLITS = 20  # ways to split the loads that calibrate from those that judge
 def network_of(body: str, data: DataSet, seconds: float, ranks: int, stepped: int = STEPPED) -> Surrogate:
     """The reduced network of a body, trained once; that of the small beam under modal loads on table 4.2's samples."""
     folder = RUNS / f"certificates-{body}-{seconds:g}s"
-    if not (folder / "surrogate.json").exists():
+
+    def learn() -> Surrogate:
         learned = data
         if body == "modal":
             learned = small_data("modal", {"train": 8192, "validation": 256, "test": 512}, ranks, jacobians=True)
         plan = TrainingPlan(Reduced(modes=case(body).modes), seconds=seconds)
-        save(with_domain(train(learned, plan), learned), folder)
-    return calibrate(load_twin(folder, data.body), data, stepped=stepped)
+        return with_domain(train(learned, plan), learned)
+
+    return calibrate(made.network(folder, data.body, learn), data, stepped=stepped)
 
 
-def set_aside(certifier: Certifier, data: DataSet, plan: Plan, problem: Problem) -> dict[str, Any]:
+def set_aside(estimator: ErrorEstimator, data: DataSet, plan: Plan, problem: Problem) -> dict[str, Any]:
     """Share of loads that is said to be outside: at the largest that were learned, and at three times these.
 
     Those of three times that are not set aside are solved: how many of them keep their bounds all the same.
@@ -65,18 +63,18 @@ def set_aside(certifier: Certifier, data: DataSet, plan: Plan, problem: Problem)
     tops = [ramp_loads(data, plan, FRESH + i)[0] for i in range(FAR)]
     found: dict[str, Any] = {}
     for scale in (1.0, 3.0):
-        given = [certifier.certify(scale * top) for top in tops]
+        given = [estimator.bound_error(scale * top) for top in tops]
         found[f"times_{scale:g}"] = float(np.mean([not each.is_inside for each in given]))
     inside = [(3.0 * top, each) for top, each in zip(tops, given, strict=True) if each.is_inside]
     kept = []
-    for load, certificate in inside:
+    for load, error_bound in inside:
         try:
             truth = problem.solve(load).displacement
         except NotConverged:
             kept.append(False)
             continue
-        missed = certifier.reader.surrogate.solve(load).displacement - truth
-        kept.append(bool(np.linalg.norm(missed, axis=1).mean() <= certificate.mean))
+        missed = estimator.reader.surrogate.solve(load).displacement - truth
+        kept.append(bool(np.linalg.norm(missed, axis=1).mean() <= error_bound.mean))
     found["times_3_inside"] = {"loads": len(kept), "kept": float(np.mean(kept)) if kept else None}
     return found
 
@@ -95,7 +93,7 @@ def resplit(surrogate: Surrogate, data: DataSet, ways: int = SPLITS) -> dict[str
     Returns:
         `kept` and `kept_in_range`, by kind of error: their `mean` and `spread` (standard deviation) over the ways.
     """
-    confidence, reader = surrogate.card["certificate"]["confidence"], SignReader(surrogate)
+    confidence, reader = surrogate.card["certificate"]["confidence"], IndicatorReader(surrogate)
     before = read_samples(reader, data, data.samples("validation"))
     held = {split: data.samples(split) for split in POOLED}
     read = [read_samples(reader, data, samples) for samples in held.values()]
@@ -132,9 +130,9 @@ def _spread(rows: list[list[float]], axis: int) -> np.ndarray:
     return np.std(rows, axis=axis, ddof=1)
 
 
-def costs(certifier: Certifier, loads: list[np.ndarray], problem: Problem) -> dict[str, float]:
+def costs(estimator: ErrorEstimator, loads: list[np.ndarray], problem: Problem) -> dict[str, float]:
     """Median wall times of a prediction and of each tier, milliseconds."""
-    surrogate = certifier.reader.surrogate
+    surrogate = estimator.reader.surrogate
     names = ("prediction", "distance", "extent", "certificate", "newton", "solve")
     taken: dict[str, list[float]] = {name: [] for name in names}
 
@@ -147,9 +145,9 @@ def costs(certifier: Certifier, loads: list[np.ndarray], problem: Problem) -> di
     for load in loads:
         state = timed("prediction", lambda load=load: surrogate.solve(load))
         timed("distance", lambda state=state: state.distance)
-        timed("extent", lambda state=state: state.extent)
-        timed("certificate", lambda load=load, state=state: certifier.certify(load, state))
-        timed("newton", lambda load=load, state=state: certifier.certify(load, state, newton=True))
+        timed("extent", lambda state=state: state.extrapolation_ratio)
+        timed("certificate", lambda load=load, state=state: estimator.bound_error(load, state))
+        timed("newton", lambda load=load, state=state: estimator.bound_error(load, state, newton=True))
         timed("solve", lambda load=load, state=state: problem.solve(load, proposal=state.displacement))
     return {name: float(np.median(values)) for name, values in taken.items()}
 
@@ -159,41 +157,70 @@ def measured(body: str, surrogate: Surrogate, data: DataSet, stepped: int) -> di
     plan = case(body).plan
     held_out = coverage(surrogate, data)
     print(held_out, flush=True)
-    certifier = Certifier(surrogate)
+    estimator = ErrorEstimator(surrogate)
     tops = [ramp_loads(data, plan, FRESH + i)[0] for i in range(TIMED)]
-    with threadpool_limits(1), Problem(data.body, plan.build_material()) as problem:
+    with Problem(data.body, plan.build_material()) as problem:
         return {
             "calibrated": surrogate.card["certificate"],
             "held_out": held_out.as_dict(),
-            "outside": set_aside(certifier, data, plan, problem),
+            "outside": set_aside(estimator, data, plan, problem),
             "held_out_newton": coverage(surrogate, data, limit=stepped, newton=True).as_dict(),
-            "ms": costs(certifier, tops, problem),
+            "ms": costs(estimator, tops, problem),
         }
 
 
-def main(words: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--bodies", nargs="+", default=["modal", "ranges", "liver-tetrahedra"], help="cases of networks_bodies.py"
-    )
-    parser.add_argument("--seconds", type=float, default=200.0, help="of training")
-    parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--stepped", type=int, default=STEPPED, help="loads that are shown a step of Newton's method")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args(words)
-    found = recorded(arguments.name)
-    for body in arguments.bodies:
-        if "resplit" in found.get(body, {}):
-            print(f"{body}: recorded before")
-            continue
-        data = data_of(body, arguments.ranks, body != "modal")
-        surrogate = network_of(body, data, arguments.seconds, arguments.ranks, arguments.stepped)
-        if body not in found:
-            found[body] = measured(body, surrogate, data, arguments.stepped)
-        found[body]["resplit"] = {**resplit(surrogate, data), "made": stamp()}
-        print(json.dumps({name: value for name, value in found[body].items() if name != "held_out"}, indent=1))
-        write(arguments.name, found)
+def work(row: str, given: Given) -> dict[str, Any]:
+    data = data_of(row, given.ranks, row != "modal")
+    surrogate = network_of(row, data, given.seconds, given.ranks, given.stepped)
+    return {**measured(row, surrogate, data, given.stepped), "resplit": resplit(surrogate, data)}
+
+
+def lines(rows: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A line for each body and tier, and one for what a prediction, its distance and a solve cost."""
+    for body, found in rows.items():
+        ms, outside = found["ms"], found["outside"]
+        for tier, held in {"certificate": found["held_out"], "newton": found["held_out_newton"]}.items():
+            told = {"outside": {**outside, "kept_inside": _kept(outside)}} if tier == "certificate" else {}
+            yield f"{body}, {tier}: {held['samples']} loads", {**held, **told, "ms": f"{ms[tier]:.2f}"}
+        costs = f"{ms['prediction']:.2f}; {ms['distance']:.3f}; {ms['solve']:.1f}"
+        yield f"{body}: prediction; distance; solve", {"ms": costs}
+
+
+def _kept(outside: dict[str, Any]) -> str:
+    inside = outside.get("times_3_inside")
+    return "-" if not inside or inside["kept"] is None else f"{100 * inside['kept']:.0f} % of {inside['loads']}"
+
+
+BENCHMARK = Benchmark(
+    name="certificates",
+    title="Bounds on errors that nobody has seen: how many keep them, their width, cost, what is set aside",
+    about=("surrogate", "reference"),
+    work=work,
+    rows=("modal", "ranges", "liver-tetrahedra"),
+    columns=(
+        Column(
+            "kept, mean error; by size",
+            "%",
+            lambda f: (
+                f"{100 * f['kept']['mean']:.1f}; "
+                + " / ".join(f"{100 * kept:.1f}" for kept in f["kept_in_range"]["mean"])
+            ),
+        ),
+        Column("width / median error; by size", "", lambda f: " / ".join(f"{w:.2f}" for w in f["widths"]["mean"])),
+        Column("rank of bound; of eta", "", "{rank_correlation.mean:.3f}; {step_correlation.mean:.3f}"),
+        Column("outside: 1 x; 3 x", "%", "{outside.times_1*100:.1f}; {outside.times_3*100:.1f}"),
+        Column("of 3 x inside kept", "", "{outside.kept_inside}"),
+        Column("unstable", "", "{unstable} of {samples}"),
+        Column("time", "ms", "{ms}"),
+    ),
+    settings={
+        "seconds": Setting(200.0, "of training"),
+        "stepped": Setting(STEPPED, "loads that are shown a step of Newton's method"),
+        "ranks": RANKS,
+    },
+    lines=lines,
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -1,6 +1,6 @@
 """One network in one table: errors, Jacobian, bounds by size of load, and solves that start from it beside those not.
 
-    python benchmarks/checked_network.py [--bodies modal] [--seconds 200] [--count 1000]
+    python benchmarks/checked_network.py [--only modal] [--seconds 200] [--count 1000]
 
 The network is that of certificates.py (the small beam under the loads of table 4.2, or under those of all sizes,
 `ranges`); errors and Jacobians are those of held-out samples, bounds those of its calibration. Fresh loads, half in the
@@ -11,16 +11,16 @@ benchmarks/runs/ where they are not there.
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Iterator
 from typing import Any
 
 from certificates import network_of
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from hybrid_newton import RANGES, STEPS, Way, alone, figures_of, loads_of, reference_way, stepped_way
 from networks import data_of as small_data
 from networks import judged
 from networks_bodies import case, data_of
-from record import recorded, write
-from threadpoolctl import threadpool_limits
 
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.generate import Plan
@@ -28,7 +28,6 @@ from softtwin.reference.solve.problem import Problem
 from softtwin.surrogate.calibration import coverage
 from softtwin.surrogate.model import Surrogate
 
-NAME = "checked_network"
 JUDGED = {"train": 8192, "validation": 256, "test": 512}  # of table 4.2, whose Jacobians are there
 
 
@@ -45,38 +44,64 @@ def solved(data: DataSet, plan: Plan, network: Surrogate, problem: Problem, coun
             way(loads[0])  # what is factored once
         taken = [{label: alone(problem, way, load) for label, way in ways.items()} for load in loads]
         truth = [each[f"{STEPS} load steps"].displacement for each in taken]
-        found[name] = {label: figures_of([each[label] for each in taken], truth) for label in ways}
+        found[name] = {label: figures_of(problem, [each[label] for each in taken], truth) for label in ways}
         print(name, found[name], flush=True)
     assert list(found) == list(RANGES)
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bodies", nargs="+", default=["modal"], choices=["modal", "ranges"])
-    parser.add_argument("--seconds", type=float, default=200.0, help="of training")
-    parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--count", type=int, default=1000, help="of fresh loads that are solved")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found = recorded(arguments.name)
-    for body in arguments.bodies:
-        if body in found:
-            print(f"{body}: recorded before")
-            continue
-        data, plan = data_of(body, arguments.ranks, body != "modal"), case(body).plan
-        network = network_of(body, data, arguments.seconds, arguments.ranks)
-        held_out = small_data("modal", JUDGED, arguments.ranks, jacobians=True) if body == "modal" else data
-        with threadpool_limits(1), Problem(data.body, plan.build_material(), plan.newton) as problem:
-            found[body] = {
-                "training": network.card["training"],
-                "learned": network.card["samples"],
-                "errors": judged(network, held_out, problem),
-                "bounds": coverage(network, data).as_dict(),
-                "solved": solved(data, plan, network, problem, arguments.count),
-            }
-        write(arguments.name, found)
+def work(row: str, given: Given) -> dict[str, Any]:
+    data, plan = data_of(row, given.ranks, row != "modal"), case(row).plan
+    network = network_of(row, data, given.seconds, given.ranks)
+    held_out = small_data("modal", JUDGED, given.ranks, jacobians=True) if row == "modal" else data
+    with Problem(data.body, plan.build_material(), plan.newton) as problem:
+        return {
+            "training": network.card["training"],
+            "learned": network.card["samples"],
+            "errors": judged(network, held_out, problem),
+            "bounds": coverage(network, data).as_dict(),
+            "solved": solved(data, plan, network, problem, given.count),
+        }
+
+
+def lines(rows: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A line for the network, and one for each range and way of solving."""
+    for body, found in rows.items():
+        yield f"{body}: the network", found
+        for name, ways in found["solved"].items():
+            yield from ((f"{body}, {name}: {way}", told) for way, told in ways.items())
+
+
+BENCHMARK = Benchmark(
+    name="checked_network",
+    title="One network in one table: errors, Jacobian, bounds by size, and solves that start from it",
+    about=("surrogate", "reference"),
+    work=work,
+    rows=("modal", "ranges"),
+    columns=(
+        Column("mean error", "mm", "{errors.nodal_error.mean*1000:.3f}"),
+        Column("relative (95 %)", "%", "{errors.relative_error.median*100:.3f} ({errors.relative_error.p95*100:.2f})"),
+        Column("cosine; Jacobian, %", "", "{errors.gradient_cosine.mean:.5f}; {errors.jacobian_error.mean*100:.2f}"),
+        Column(
+            "bounds kept; by size",
+            "%",
+            lambda f: (
+                f"{100 * f['bounds']['kept']['mean']:.1f}; "
+                + " / ".join(f"{100 * kept:.1f}" for kept in f["bounds"]["kept_in_range"]["mean"])
+            ),
+        ),
+        Column("same state", "", "{same_state} of {loads}"),
+        Column("iterations; factorisations", "", "{iterations:.1f}; {factorisations:.2f}"),
+        Column("median; mean", "ms", "{median_ms:.1f}; {mean_ms:.1f}"),
+    ),
+    settings={
+        "seconds": Setting(200.0, "of training"),
+        "count": Setting(1000, "of fresh loads that are solved"),
+        "ranks": RANKS,
+    },
+    lines=lines,
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -1,6 +1,6 @@
 """Clouds of which a part is not where the organ is: an instrument over it, a patch that the camera has seen elsewhere.
 
-    python benchmarks/foreign_patches.py [--twin TWIN] [--engines surrogate reference] [--draws 8]
+    python benchmarks/foreign_patches.py [--twin TWIN] [--only surrogate ...] [--draws 8]
 
 Frames 5, 15, 25 and 40 of s1, s2 and s3 of the real liver, each from rest and told the zone. About a random point of
 the cloud its nearest points, a share of all, are moved towards the camera: all as far (`raised`, as by a wrong stereo
@@ -12,26 +12,27 @@ frames that are doubtful for nothing but that they ask for more of it than was s
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from liver import SEQUENCES, sequence
-from networks import RUNS
 from numpy.typing import NDArray
-from record import recorded, stamp, write
+from record import RUNS
 from robustness import clean, forward_model, registrar_for, towards_camera
-from threadpoolctl import threadpool_limits
+from summaries import counts
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.outcome import NotConverged
+from softtwin.registration.forward import ForwardModel
+from softtwin.registration.registrar import Registrar
 from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
 Moved = Callable[[Floats, Body, np.random.Generator], Floats]
-NAME, FRAMES = "foreign_patches", (5, 15, 25, 40)
+FRAMES = (5, 15, 25, 40)
 _RADIUS, _REACH = 5e-3, 0.02  # of the shaft; how far it goes beyond the point it reaches for, metres
 
 
@@ -92,7 +93,7 @@ def judged(result: Registration, rest: Floats, truth: Floats) -> dict[str, Any]:
         "verdict": result.judgement.verdict.value,
         "tre_mm": 1e3 * float(errors.mean()),
         "held": float((errors <= result.uncertainty.margin()).mean()),
-        "model_doubt": result.doubt,
+        "model_doubt": result.discrepancy_scale,
         "outliers": result.outliers,
         "by_error": len(reasons) == 1 and "seen to get wrong" in reasons[0],
     }
@@ -101,8 +102,7 @@ def judged(result: Registration, rest: Floats, truth: Floats) -> dict[str, Any]:
 def summary(rows: list[dict[str, Any]], failed: int) -> dict[str, Any]:
     """Over all frames, and over those that were accepted; frames without a state are counted alone."""
     found: dict[str, Any] = {"frames": len(rows) + failed, "failed": failed}
-    verdicts = [row["verdict"] for row in rows]
-    found["verdicts"] = {name: verdicts.count(name) for name in sorted(set(verdicts))}
+    found["verdicts"] = counts(row["verdict"] for row in rows)
     groups = {
         "all": rows,
         "accepted": [row for row in rows if row["verdict"] == "accepted"],
@@ -137,25 +137,44 @@ def row_of(name: str, registrars: dict[str, Any], body: Body, draws: int) -> dic
     return summary(rows, failed)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--twin", type=Path, default=RUNS / "liver" / "twin")
-    parser.add_argument("--engines", nargs="+", default=["surrogate", "reference"], choices=["surrogate", "reference"])
-    parser.add_argument("--draws", type=int, default=8)
-    parser.add_argument("--reference-draws", type=int, default=2)
-    arguments = parser.parse_args()
-    found = recorded(NAME)
-    for engine in arguments.engines:
-        draws = arguments.draws if engine == "surrogate" else arguments.reference_draws
-        with threadpool_limits(1), forward_model(engine, arguments.twin) as model:
-            registrars = {s: registrar_for(model, sequence(s).zone, True) for s in SEQUENCES}
-            for name in ROWS:
-                key = f"{engine}: {name}"
-                if key not in found:
-                    found[key] = {**row_of(name, registrars, model.body, draws), "made": stamp()}
-                    write(NAME, found)
-                print(key, found[key], flush=True)
+def work(row: str, given: Given) -> dict[str, Any]:
+    engine, name = row.split(": ")
+    model = given.opened(forward_model, engine, given.twin)
+    registrars = {s: given.once(registrar_for_sequence, model, s) for s in SEQUENCES}
+    return row_of(name, registrars, model.body, given.draws if engine == "surrogate" else given.reference_draws)
+
+
+def registrar_for_sequence(model: ForwardModel, name: str) -> Registrar:
+    """Told the zone of a sequence."""
+    return registrar_for(model, sequence(name).zone, True)
+
+
+def of(group: str) -> str:
+    """The cell of a group of frames."""
+    return f"{{{group}.frames}}: {{{group}.tre_mm:.2f}} ({{{group}.tre_most_mm:.2f}})"
+
+
+BENCHMARK = Benchmark(
+    name="foreign_patches",
+    title="Clouds of which a part is not where the organ is: what is accepted, and how far it is off",
+    about=("registration", "surrogate", "reference"),
+    work=work,
+    rows=tuple(f"{engine}: {name}" for engine in ("surrogate", "reference") for name in ROWS),
+    columns=(
+        Column("frames; failed", "", "{frames}; {failed}"),
+        Column("all: TRE (largest)", "mm", "{all.tre_mm:.2f} ({all.tre_most_mm:.2f})"),
+        Column("accepted: TRE (largest)", "mm", of("accepted")),
+        Column("told by the model's error: TRE (largest)", "mm", of("told by the model's error")),
+        Column("held", "%", "{accepted.held*100:.0f}"),
+    ),
+    settings={
+        "twin": Setting(RUNS / "liver" / "twin", "that registration_surrogate.py makes", picks=True),
+        "draws": Setting(8, "of each frame, with the surrogate"),
+        "reference_draws": Setting(2),
+    },
+    small={"draws": 1, "reference_draws": 1},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

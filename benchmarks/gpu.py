@@ -221,7 +221,7 @@ def prediction(surrogate: Surrogate, data: DataSet, device: Any, calls: int, lar
             "memory_mib": torch.cuda.max_memory_allocated() / 2**20 if device == "cuda" else None,
         }
         del fast
-    inputs = 3 * len(surrogate.maps.loaded)
+    inputs = 3 * len(surrogate.encoder_decoder.loaded)
     plain = Value(surrogate, np.eye(inputs)).to(device).eval().requires_grad_(False)
     host = torch.from_numpy(forces[:1, data.response.loaded].reshape(1, -1)).float()
     with torch.no_grad(), without_tf32():

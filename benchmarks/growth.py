@@ -3,23 +3,22 @@
 Bending of the beam (1 x 0.25 x 0.25 m, linear hexahedra, Neo-Hookean, E = 5000 Pa, nu = 0.45) by 1 N at its tip, from
 rest, each case in a process of its own.
 
-python benchmarks/growth.py            all cases, about 40 minutes
-python benchmarks/growth.py 30000      sizes up to that
+    python benchmarks/growth.py                      all cases, about 40 minutes
+    python benchmarks/growth.py --largest 30000      sizes up to that
 """
 
 from __future__ import annotations
 
 import json
-import os
 import resource
 import subprocess
-import sys
 import time
 from typing import Any
 
 import numpy as np
+from columns import Column
+from harness import Benchmark, Given, Setting, run, started
 from mpi4py import MPI
-from record import write
 
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import NeoHookean
@@ -60,11 +59,9 @@ def one(wanted: float, method: Any) -> dict[str, Any]:
 
 def case(size: float, method: str, ranks: int) -> dict[str, Any]:
     """One case in processes of its own; what went wrong is part of the answer."""
-    launch = [] if ranks == 1 else ["mpirun", "--bind-to", "none", "-n", str(ranks)]
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    command = [*launch, sys.executable, __file__, "--one", str(size), method]
+    how = {"check": False, "capture_output": True, "timeout": TIMEOUT_S}
     try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S)
+        done = started(__file__, "one", str(size), method, ranks=ranks, **how)
     except subprocess.TimeoutExpired:
         return {"wanted": size, "method": method, "ranks": ranks, "failed": f"more than {TIMEOUT_S} s"}
     lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
@@ -81,33 +78,59 @@ def exponent(rows: list[dict[str, Any]], quantity: str) -> float | None:
     return float(np.polyfit(*(np.log([row[key] for row in large]) for key in ("unknowns", quantity)), 1)[0])
 
 
-def main(largest: float) -> None:
-    rows = []
-    for method, sizes in SIZES.items():
-        for ranks in (1, 2):
-            for size in sizes:
-                if size > largest:
-                    continue
-                if size == sizes[0]:
-                    case(size, method, ranks)  # compiles the forms
-                rows.append(case(size, method, ranks))
-                print(rows[-1], flush=True)
-    fits = {
-        f"{method}, {ranks} rank{'s' * (ranks > 1)}": {
-            quantity: exponent([r for r in rows if (r["method"], r["ranks"]) == (method, ranks)], quantity)
-            for quantity in ("solve_s", "peak_GiB")
+CASES = {
+    f"{method}, {ranks} rank{'s' * (ranks > 1)}, {size:g}": (method, ranks, size)
+    for method, sizes in SIZES.items()
+    for ranks in (1, 2)
+    for size in sizes
+}
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    method, ranks, _ = CASES[row]
+    given.once(case, SIZES[method][0], method, ranks)  # compiles the forms
+    return case(CASES[row][2], method, ranks)
+
+
+def exponents(figures: dict[str, Any], given: Given) -> dict[str, Any]:
+    """Of time and memory over the unknowns, by method and ranks."""
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for row, found in figures["cases"].items():
+        groups.setdefault(row.rpartition(", ")[0], []).append(found)
+    return {
+        "exponents_from_1e4_unknowns": {
+            name: {quantity: exponent(rows, quantity) for quantity in ("solve_s", "peak_GiB")}
+            for name, rows in groups.items()
         }
-        for method in SIZES
-        for ranks in (1, 2)
     }
-    print(fits)
-    write("growth", {"cases": rows, "exponents_from_1e4_unknowns": fits})
+
+
+def alone(size: str, method: str) -> None:
+    """One case, on the ranks that mpirun has started."""
+    found = one(float(size), method)
+    if MPI.COMM_WORLD.rank == 0:
+        print(json.dumps(found))
+
+
+BENCHMARK = Benchmark(
+    name="growth",
+    title="How time and memory of a solve grow with the unknowns: MUMPS and multigrid, one rank and two",
+    about=("reference/fem", "reference/solve"),
+    work=work,
+    rows=lambda given: [row for row, (*_, size) in CASES.items() if size <= given.largest],
+    columns=(
+        Column("unknowns", "", "{unknowns:,}"),
+        Column("set-up", "s", "{setup_s:.1f}"),
+        Column("solve", "s", "{solve_s:.1f}"),
+        Column("memory", "GiB", "{peak_GiB:.2f}"),
+        Column("iterations; factorisations", "", "{iterations}; {factorisations}"),
+    ),
+    settings={"largest": Setting(1e6, "unknowns", picks=True)},
+    small={"largest": 1e3},
+    under="cases",
+    finish=exponents,
+)
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--one"]:
-        found = one(float(sys.argv[2]), sys.argv[3])
-        if MPI.COMM_WORLD.rank == 0:
-            print(json.dumps(found))
-    else:
-        main(float(sys.argv[1]) if len(sys.argv) > 1 else np.inf)
+    run(BENCHMARK, parts={"one": alone})

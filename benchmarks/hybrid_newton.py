@@ -1,34 +1,35 @@
 """Newton's method from a network's prediction (thesis, table 5.3): shares, iterations, factorisations, times, states.
 
-    python benchmarks/hybrid_newton.py [--bodies small large liver] [--seconds 300] [--only ours]
+    python benchmarks/hybrid_newton.py [--bodies small large liver] [--seconds 300]
 
 Half of the loads are drawn like those that were learned (and are none of them), half are up to twice as large. A
 failure counts at the time it took. Every state found is compared with the one that 20 load steps lead to from rest,
 each from the displacement before and with nothing else to fall back on; negative pivots of its tangent are counted
 afterwards. Softtwin's own ways may take as many load steps as a configuration allows by default. All ways but the load
-steps, which come first, solve each load in turn. What is finished is written; the same command goes on. Data and
+steps, which come first, solve each load in turn. Data and
 networks are made under benchmarks/runs/ where they are not there.
 """
 
 from __future__ import annotations
 
-import argparse
 import copy
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+import made
 import numpy as np
 import torch
-from networks import RUNS
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from networks import data_of as small_data
 from networks_bodies import case
 from networks_bodies import data_of as body_data
 from numpy.typing import NDArray
-from record import recorded, stamp, write
-from threadpoolctl import threadpool_limits
+from record import RUNS
 
 from softtwin.app.config import SolverSection
 from softtwin.reference.data.dataset import DataSet
@@ -40,11 +41,8 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
-from softtwin.surrogate.twin import load as load_twin
-from softtwin.surrogate.twin import save
 
 Floats = NDArray[np.float64]
-NAME = "hybrid_newton"
 COUNTS = {"small": 1000, "large": 100, "liver": 100}
 CASES = {"large": "beam-few", "liver": "liver-tetrahedra"}  # of networks_bodies.py
 FRESH = 1_000_000  # numbers of loads begin here: none of them is in a data set
@@ -159,7 +157,7 @@ def stepped_way(problem: Problem) -> Way:
 def without_training(network: Surrogate) -> Surrogate:
     """The same network with random weights of the same sizes."""
     generator = torch.Generator().manual_seed(0)
-    other = Surrogate(network.body, network.maps, copy.deepcopy(network.network), network.card)
+    other = Surrogate(network.body, network.encoder_decoder, copy.deepcopy(network.network), network.card)
     for weights in other.network.parameters():
         noise = torch.randn(weights.shape, generator=generator, dtype=weights.dtype)
         weights.data = weights.std(correction=0) * noise
@@ -175,11 +173,9 @@ def data_of(body: str, ranks: int) -> DataSet:
 
 def network_of(body: str, data: DataSet, seconds: float) -> Surrogate:
     """The reduced network of a body, trained once."""
-    folder = RUNS / f"hybrid-{body}-{seconds:g}s"
-    if not (folder / "surrogate.json").exists():
-        modes = Reduced().modes if body == "small" else case(CASES[body]).modes
-        save(train(data, TrainingPlan(Reduced(modes=modes), seconds=seconds)), folder)
-    return load_twin(folder, data.body)
+    modes = Reduced().modes if body == "small" else case(CASES[body]).modes
+    plan = TrainingPlan(Reduced(modes=modes), seconds=seconds)
+    return made.network(RUNS / f"hybrid-{body}-{seconds:g}s", data.body, lambda: train(data, plan))
 
 
 def loads_of(data: DataSet, plan: Plan, count: int) -> dict[str, Floats]:
@@ -238,48 +234,78 @@ def truth_of(body: str, problem: Problem, loads: dict[str, Floats]) -> tuple[dic
     return truth, json.loads(kept.read_text())
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bodies", nargs="+", default=["small", "large"], choices=list(COUNTS))
-    parser.add_argument("--seconds", type=float, default=300.0, help="of training")
-    parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--count", type=int, help="of loads, in place of 1,000, 100 and 100")
-    parser.add_argument("--only", default="", help="ways that have this in their name")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found = recorded(arguments.name)
-    for body in arguments.bodies:
-        data = data_of(body, arguments.ranks)
-        plan = plan_from_header(data.header)
-        network = network_of(body, data, arguments.seconds)
-        loads = loads_of(data, plan, arguments.count or COUNTS[body])
-        patient = replace(plan.newton, max_load_steps=SolverSection().max_load_steps)
-        with threadpool_limits(1), Problem(data.body, plan.build_material(), patient) as problem:
-            truth, stepped = truth_of(body, problem, loads)
-            ways = {
-                "full steps from rest (algorithm 4)": printed_way(problem, None),
-                "algorithm 5 as printed": printed_way(problem, network),
-                "cold": reference_way(problem, None),
-                "ours": reference_way(problem, network),
-                "ours, random weights": reference_way(problem, without_training(network)),
-            }
-            for name in RANGES:
-                found[f"{body}, {name}: {STEPS} load steps"] = stepped[name]
-            for name in RANGES:
-                wanted = {label: solve for label, solve in ways.items() if f"{body}, {name}: {label}" not in found}
-                wanted = {label: solve for label, solve in wanted.items() if arguments.only in label}
-                for solve in wanted.values():
-                    solve(loads[name][0])  # what is factored once
-                taken = [
-                    {label: alone(problem, solve, load) for label, solve in wanted.items()} for load in loads[name]
-                ]
-                for label in wanted:
-                    key = f"{body}, {name}: {label}"
-                    of_way = figures_of(problem, [each[label] for each in taken], truth[name])
-                    found[key] = {**of_way, "made": stamp(), "training_seconds": arguments.seconds}
-                    print(key, found[key], flush=True)
-                write(arguments.name, found)
+ROWS = {f"{body}, {name}": (body, name) for body in COUNTS for name in RANGES}
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A body's loads by range, its problem and network, and the states that load steps lead to."""
+
+    loads: dict[str, Floats]
+    problem: Problem
+    network: Surrogate
+    truth: dict[str, list[Any]]
+    stepped: dict[str, Any]
+
+
+@contextmanager
+def prepared(body: str, ranks: int, count: int | None, seconds: float) -> Iterator[Prepared]:
+    """All of it; data and networks are made where they are not there."""
+    data = data_of(body, ranks)
+    plan = plan_from_header(data.header)
+    loads = loads_of(data, plan, count or COUNTS[body])
+    patient = replace(plan.newton, max_load_steps=SolverSection().max_load_steps)
+    with Problem(data.body, plan.build_material(), patient) as problem:
+        yield Prepared(loads, problem, network_of(body, data, seconds), *truth_of(body, problem, loads))
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    """All ways on the loads of one range; they solve each load in turn, so that a busy machine is busy for all."""
+    body, name = ROWS[row]
+    known: Prepared = given.opened(prepared, body, given.ranks, given.count, given.seconds)
+    problem, loads = known.problem, known.loads[name]
+    ways = {
+        "full steps from rest (algorithm 4)": printed_way(problem, None),
+        "algorithm 5 as printed": printed_way(problem, known.network),
+        "cold": reference_way(problem, None),
+        "ours": reference_way(problem, known.network),
+        "ours, random weights": reference_way(problem, without_training(known.network)),
+    }
+    for solve in ways.values():
+        solve(loads[0])  # what is factored once
+    taken = [{label: alone(problem, solve, load) for label, solve in ways.items()} for load in loads]
+    found = {label: figures_of(problem, [each[label] for each in taken], known.truth[name]) for label in ways}
+    return {f"{STEPS} load steps": known.stepped[name], **found}
+
+
+def each_way(rows: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A line for each way."""
+    return ((f"{row}: {way}", found) for row, ways in rows.items() for way, found in ways.items())
+
+
+BENCHMARK = Benchmark(
+    name="hybrid_newton",
+    title="Newton's method from a network's prediction (table 5.3): states, iterations, factorisations, times",
+    about=("reference", "surrogate"),
+    work=work,
+    rows=lambda given: [row for row, (body, _) in ROWS.items() if body in given.bodies],
+    columns=(
+        Column("same state", "", "{same_state} of {compared}"),
+        Column("converged; unstable", "", "{converged} of {loads}; {unstable}"),
+        Column("prediction picked", "", lambda f: f"{100 * f['picked'] / f['loads']:.0f} %"),
+        Column("where solved: iterations; factorisations", "", "{iterations:.1f}; {factorisations:.2f}"),
+        Column("median; mean; 95 %", "ms", "{median_ms:.1f}; {mean_ms:.1f}; {p95_ms:.0f}"),
+    ),
+    settings={
+        "bodies": Setting(("small", "large"), choices=tuple(COUNTS), picks=True),
+        "seconds": Setting(300.0, "of training"),
+        "count": Setting(None, "of loads, in place of 1,000, 100 and 100", kind=int),
+        "ranks": RANKS,
+    },
+    seeds=(0, 5),
+    lines=each_way,
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

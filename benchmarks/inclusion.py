@@ -1,6 +1,6 @@
 """Material beside forces on the quickstart's phantom: force / E with Poisson's ratio; a stiff tumour and the rest.
 
-    python benchmarks/inclusion.py [--count 20] [--rows ...]
+    python benchmarks/inclusion.py [--count 20] [--only ROW ...]
 
 A pull on a patch of the seen side, another one each case, moves the organ by up to 24 mm; for the tumour the patch lies
 above it, as where a surgeon feels for one. The cloud is the quickstart camera's, 1,000 points with 0.5 mm of noise;
@@ -12,14 +12,14 @@ verdicts. Reference engine, from rest. Refused frames are counted and are in the
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from columns import Column, verdicts
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
-from record import recorded, stamp, write
-from threadpoolctl import threadpool_limits
+from summaries import counts
 
 from softtwin.app.identify import together
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS, quickstart_config
@@ -31,14 +31,13 @@ from softtwin.reference.data.loading import Loading
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.solve.problem import NewtonOptions, Problem
-from softtwin.registration.conditions import WITHIN_90, Conditions, Estimate, PoissonRatio, Stiffness
 from softtwin.registration.options import expected_force, options_for
+from softtwin.registration.parameter_blocks import WITHIN_90, Estimate, ParameterBlocks, PoissonRatio, YoungModulus
 from softtwin.registration.registrar import prepare
 from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-NAME = "inclusion"
 MODULUS, RATIO, MOVED = 5000.0, 0.45, 0.024  # pascals; metres that the largest node moves
 KNOWN, STIFFER = 0.3, (2.0, 8.0)  # deviation of the logarithm of the rest's modulus; times as stiff as the rest
 TOOL, ZONE, ABOVE = 0.03, 0.05, 0.01  # radii of the patch and of the zone, how far off the tumour it lies, metres
@@ -76,15 +75,15 @@ def drawn(
 
 
 def registered(
-    body: Body, cloud: Floats, zone: Ints | None, conditions: Conditions, known: Floats | None = None
+    body: Body, cloud: Floats, zone: Ints | None, parameter_blocks: ParameterBlocks, known: Floats | None = None
 ) -> Registration:
     """The cloud, with forces in a zone, or with all of them known."""
-    with Problem(body, NeoHookean(**conditions.parameters), SEARCH) as problem:
+    with Problem(body, NeoHookean(**parameter_blocks.parameters), SEARCH) as problem:
         model = ReferenceModel(problem, patient=False, loading=Loading(forces=known))
         scale = expected_force(body, MODULUS)
         registrar = prepare(
             model, zone, body.surfaces["observed"], force_scale=scale, options=options_for(model, zone is not None),
-            conditions=conditions,
+            parameter_blocks=parameter_blocks,
         )  # fmt: skip
         return told(registrar.register(cloud))
 
@@ -108,19 +107,19 @@ def of_unknowns(estimates: Sequence[Estimate], true: dict[str, float]) -> dict[s
     for estimate in estimates:
         value, (low, high) = true[estimate.name], estimate.interval
         off = abs(estimate.value - value) / (value if estimate.unit == "Pa" else 1.0)
-        found[estimate.name] = {"off": off, "within": float(low <= value <= high), "told": estimate.told}
+        found[estimate.name] = {"off": off, "within": float(low <= value <= high), "told": estimate.variance_reduction}
     return found
 
 
 def force_over_modulus(body: Body, seed: int) -> dict[str, Any]:
     """Forces, E and nu unknown: force / E against the truth's."""
     rng = np.random.default_rng([seed, 0])
-    prior = Stiffness(KNOWN), PoissonRatio(0.5)
-    conditions = Conditions(body, {"young_modulus": MODULUS, "poisson_ratio": RATIO}, prior)
-    material = conditions.inputs(rng.standard_normal(2)).parameters
+    prior = YoungModulus(KNOWN), PoissonRatio(0.5)
+    parameter_blocks = ParameterBlocks(body, {"young_modulus": MODULUS, "poisson_ratio": RATIO}, prior)
+    material = parameter_blocks.inputs(rng.standard_normal(2)).parameters
     modulus, ratio = float(np.mean(material["young_modulus"])), float(np.mean(material["poisson_ratio"]))
     forces, zone, truth, cloud = drawn(body, modulus, ratio, seed)
-    found = registered(body, cloud, zone, conditions)
+    found = registered(body, cloud, zone, parameter_blocks)
     row = figures(found, truth, {"Young's modulus": modulus, "Poisson's ratio": ratio})
     assert found.force_over_modulus is not None
     for name, value, doubt, true in (
@@ -140,11 +139,11 @@ def inclusion(body: Body, seed: int, is_known: bool, clouds: int = 1) -> dict[st
     moduli = np.full(len(body.cells), rest)
     moduli[region] *= times
     parameters = {"young_modulus": np.full(len(body.cells), MODULUS), "poisson_ratio": RATIO}
-    conditions = Conditions(body, parameters, (Stiffness(KNOWN), Stiffness(1.0, region, "tumour")))
+    parameter_blocks = ParameterBlocks(body, parameters, (YoungModulus(KNOWN), YoungModulus(1.0, region, "tumour")))
     true, rows, found = {"Young's modulus": rest, "Young's modulus of tumour": rest * times}, [], []
     for number in range(clouds):
         forces, zone, truth, cloud = drawn(body, moduli, RATIO, FURTHER * number + seed, "tumour")
-        result = registered(body, cloud, None if is_known else zone, conditions, forces if is_known else None)
+        result = registered(body, cloud, None if is_known else zone, parameter_blocks, forces if is_known else None)
         found.append(result)
         rows.append(figures(result, truth, true))
     worst = max(rows, key=lambda row: ("accepted", "doubtful", "refused").index(row["verdict"]))
@@ -162,8 +161,7 @@ ROWS: dict[str, Callable[[Body, int], dict[str, Any]]] = {
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Over all cases."""
-    verdicts = [row["verdict"] for row in rows]
-    found: dict[str, Any] = {"verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))}}
+    found: dict[str, Any] = {"verdicts": counts(row["verdict"] for row in rows)}
     for name in ("error_mm", "seconds"):
         found[name] = spread([row[name] for row in rows])
     for name in rows[0]["unknowns"]:
@@ -182,21 +180,32 @@ def spread(values: list[float]) -> dict[str, float]:
     return {"mean": float(np.mean(values)), "median": float(np.median(values)), "largest": float(np.max(values))}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=20, help="cases of each row")
-    parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=list(ROWS))
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found, body = recorded(arguments.name), liver_phantom(quickstart_config(False).body.cell_size)
-    for label in arguments.rows:
-        if found.get(label, {}).get("count") != arguments.count:
-            with threadpool_limits(1):
-                rows = [ROWS[label](body, seed) for seed in range(arguments.count)]
-            found[label] = {"count": arguments.count, "summary": summary(rows), "cases": rows, "made": stamp()}
-            write(arguments.name, found)
-        print(label, found[label]["summary"], sep="\n  ", flush=True)
+def work(row: str, given: Given) -> dict[str, Any]:
+    body = given.once(liver_phantom, quickstart_config(False).body.cell_size)
+    cases = [ROWS[row](body, seed) for seed in range(given.count)]
+    return {"count": given.count, "summary": summary(cases), "cases": cases}
+
+
+BENCHMARK = Benchmark(
+    name="inclusion",
+    title="Material beside forces on the phantom: force / E with Poisson's ratio; a stiff tumour and the rest",
+    about=("registration", "reference"),
+    work=work,
+    rows=tuple(ROWS),
+    columns=(
+        Column("accepted; doubtful; refused", "", verdicts),
+        Column("mean nodal error", "mm", "{error_mm.mean:.2f}"),
+        *(
+            Column(f"{name}: off; within 90 %", "%", f"{{{name}.off.median*100:.0f}}; {{{name}.within_90*100:.0f}}")
+            for name in ("force / E", "Young's modulus", "Young's modulus of tumour", "Poisson's ratio")
+        ),
+        Column("median", "s", "{seconds.median:.1f}"),
+    ),
+    settings={"count": Setting(20, "cases of each row")},
+    small={"count": 1},
+    lines=lambda rows: ((name, found["summary"]) for name, found in rows.items()),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -9,7 +9,6 @@ Every case counts: one that ends elsewhere or not at all is a failure of its row
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Iterator
@@ -19,10 +18,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
-from record import recorded, write
 from scipy.sparse.linalg import splu
-from threadpoolctl import threadpool_limits
+from summaries import counts
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
@@ -35,25 +35,24 @@ from softtwin.reference.derivatives.layer import EquilibriumLayer
 from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.generate import Plan, generate, ramp_loads
 from softtwin.reference.solve.problem import NewtonOptions, Problem
-from softtwin.registration.conditions import Condition, Conditions, PoissonRatio, Stiffness
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import GaussNewton
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.loss import Square
 from softtwin.registration.options import NOISE, expected_force
+from softtwin.registration.parameter_blocks import ParameterBlock, ParameterBlocks, PoissonRatio, YoungModulus
+from softtwin.registration.priors import known_forces, nodal_forces
 from softtwin.registration.problem import Problem as Search
 from softtwin.registration.registrar import prepare
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import known_forces, nodal_forces
 from softtwin.registration.verdict import Verdict
 from softtwin.surrogate.residual import ElasticBody
 
 Floats = NDArray[np.float64]
-NAME = "inverse"
 MODULUS, RATIO, AMPLITUDE = 4500.0, 0.49, 0.03
 TIGHT = NewtonOptions(tolerance=1e-12)
-EXACT = Scale(1e-9, 0.0, least=1e-9)  # metres: clouds without noise
-SOLVER = GaussNewton((Square(),), max_iterations=100, settled=1e-3, least_step=1e-14, graduation=0.0)
+EXACT = LogNormalPrior(1e-9, 0.0, minimum=1e-9)  # metres: clouds without noise
+SOLVER = GaussNewton((Square(),), max_iterations=100, settled=1e-3, minimum_step=1e-14, graduation=0.0)
 RESTED, STEPS = 100, 5  # loads that the independent minimiser goes to from rest, and in how many steps
 POINTS, _LEFT = 2000, 5e-5  # metres that a search may leave of a cloud without noise
 SMOOTH = 0.1  # metres: neighbouring forces are alike where a search begins again at rest; afterwards each is its own
@@ -227,7 +226,7 @@ def force(body: Body, count: int) -> dict[str, Any]:
             cloud, start = cloud_of(body, truth, rng), list(rows)[place % 2]
             support = np.flatnonzero(np.abs(forces).sum(axis=1) > 0.0)
             scale = expected_force(body, MODULUS)
-            unknown = nodal_forces(body, support, Scale(scale, 1.0, least=1e-3 * scale))
+            unknown = nodal_forces(body, support, LogNormalPrior(scale, 1.0, minimum=1e-3 * scale))
             reduced = reduce_model(model, observed.nodes, unknown.basis)
             begun = -forces[unknown.nodes].ravel() if place % 2 == 0 else 1e-2 * rng.standard_normal(unknown.size)
             clock = time.perf_counter()
@@ -235,19 +234,19 @@ def force(body: Body, count: int) -> dict[str, Any]:
                 search = Search(reduced, observed, unknown, None, cloud, NOISE)
                 ended = GaussNewton().solve(search, begun)
                 solved = ended.evaluations
-                if ended.trial.match.rms > _LEFT:  # as `Registrar.follow` does where a start leads astray
+                if ended.evaluation.match.rms > _LEFT:  # as `Registrar.follow` does where a start leads astray
                     smooth = nodal_forces(body, support, unknown.scale, SMOOTH)
                     first = replace(search, model=reduce_model(model, observed.nodes, smooth.basis), forces=smooth)
                     rough = GaussNewton().solve(first, np.zeros(smooth.size))
-                    begun = smooth.forces(rough.trial.coefficients)[unknown.nodes].ravel()
+                    begun = smooth.forces(rough.evaluation.coefficients)[unknown.nodes].ravel()
                     again = GaussNewton().solve(search, begun)
                     solved += rough.evaluations + again.evaluations
                     from_rest.append(number)
-                    ended = min(ended, again, key=lambda found: found.trial.match.rms)
+                    ended = min(ended, again, key=lambda found: found.evaluation.match.rms)
                 for noise in (1e-5, 1e-6, 1e-7):  # a cloud without noise, believed more and more
-                    search = replace(search, noise=Scale(noise, 0.0, least=noise))
+                    search = replace(search, noise=LogNormalPrior(noise, 0.0, minimum=noise))
                     ended = replace(SOLVER, settled=1e-2, trusted=3.0).solve(
-                        search, ended.trial.coefficients, ended.trial
+                        search, ended.evaluation.coefficients, ended.evaluation
                     )
                     solved += ended.evaluations
             except NotConverged:
@@ -255,9 +254,9 @@ def force(body: Body, count: int) -> dict[str, Any]:
                 continue
             spent.append(time.perf_counter() - clock)
             evaluations.append(solved)
-            row = distances(ended.trial.state.full.displacement, truth)
+            row = distances(ended.evaluation.state.full.displacement, truth)
             row["force_off"] = float(
-                np.linalg.norm(unknown.forces(ended.trial.coefficients) - forces) / np.linalg.norm(forces)
+                np.linalg.norm(unknown.forces(ended.evaluation.coefficients) - forces) / np.linalg.norm(forces)
             )
             rows[start].append(row)
             if row["mean"] > 1e-6:
@@ -282,7 +281,7 @@ def force(body: Body, count: int) -> dict[str, Any]:
     found["seconds"], found["evaluations"] = float(np.mean(spent)), float(np.mean(evaluations))
     found["wrong support"] = {
         name: {
-            "verdicts": {verdict: verdicts.count(verdict) for verdict in sorted(set(verdicts))},
+            "verdicts": counts(verdicts),
             "mean_nodal_m": float(np.mean(misses[name])) if misses[name] else None,
             "accepted_mean_nodal_m": float(np.mean(accepted[name])) if accepted[name] else None,
             "accepted_largest_mean_nodal_m": max(accepted[name], default=None),
@@ -293,7 +292,7 @@ def force(body: Body, count: int) -> dict[str, Any]:
 
 
 def controlled(
-    body: Body, count: int, unknowns: tuple[Condition, ...], starts: list[dict[str, float]]
+    body: Body, count: int, unknowns: tuple[ParameterBlock, ...], starts: list[dict[str, float]]
 ) -> tuple[list[dict[str, float]], list[int], list[float]]:
     """Material parameters found from clouds under known forces: what they are off, what failed, seconds."""
     rows, failed, spent = [], [], []
@@ -304,21 +303,21 @@ def controlled(
             truth = ReferenceModel(problem).solve(forces).displacement
             cloud = cloud_of(body, truth, np.random.default_rng(number))
             model = ReferenceModel(problem, patient=True, loading=Loading(forces=forces))
-            conditions = Conditions(body, start, unknowns)
-            none = known_forces(body, Scale(1.0, 0.0))
+            parameter_blocks = ParameterBlocks(body, start, unknowns)
+            none = known_forces(body, LogNormalPrior(1.0, 0.0))
             search = Search(
-                reduce_model(model, observed.nodes, none.basis, conditions), observed, none, None, cloud, EXACT,
-                conditions=conditions,
+                reduce_model(model, observed.nodes, none.basis, parameter_blocks), observed, none, None, cloud, EXACT,
+                parameter_blocks=parameter_blocks,
             )  # fmt: skip
             clock = time.perf_counter()
             try:
-                ended = SOLVER.solve(search, np.zeros(conditions.count))
+                ended = SOLVER.solve(search, np.zeros(parameter_blocks.count))
             except NotConverged:
                 failed.append(number)
                 continue
             spent.append(time.perf_counter() - clock)
-            inputs = conditions.inputs(ended.trial.coefficients).parameters
-            row = distances(ended.trial.state.full.displacement, truth)
+            inputs = parameter_blocks.inputs(ended.evaluation.coefficients).parameters
+            row = distances(ended.evaluation.state.full.displacement, truth)
             row["modulus_off"] = abs(float(inputs["young_modulus"]) / MODULUS - 1.0)
             row["ratio_off"] = abs(float(inputs["poisson_ratio"]) / RATIO - 1.0)
             row["evaluations"] = float(ended.evaluations)
@@ -330,7 +329,7 @@ def stiffness(body: Body, count: int) -> dict[str, Any]:
     """Section 7.2.3: Young's modulus from 1e6 to 1e10 Pa towards 4500."""
     rng = np.random.default_rng(0)
     starts = [{"young_modulus": float(10.0 ** rng.uniform(6.0, 10.0)), "poisson_ratio": RATIO} for _ in range(count)]
-    rows, failed, spent = controlled(body, count, (Stiffness(10.0),), starts)
+    rows, failed, spent = controlled(body, count, (YoungModulus(10.0),), starts)
     reached = sum(row["modulus_off"] <= 1e-8 for row in rows)
     return {"loads": count, "failed": failed, "within_1e-8": reached, **_found(rows, spent)}
 
@@ -351,7 +350,7 @@ def both(body: Body, count: int) -> dict[str, Any]:
         {"young_modulus": float(10.0 ** rng.uniform(3.0, 7.0)), "poisson_ratio": float(rng.uniform(0.25, 0.499))}
         for _ in range(count)
     ]
-    rows, failed, spent = controlled(body, count, (Stiffness(10.0), PoissonRatio(10.0)), starts)
+    rows, failed, spent = controlled(body, count, (YoungModulus(10.0), PoissonRatio(10.0)), starts)
     reached = sum(row["ratio_off"] <= 1e-5 and row["modulus_off"] <= 1e-5 for row in rows)
     return {"loads": count, "failed": failed, "within_1e-5": reached, **_found(rows, spent)}
 
@@ -385,21 +384,60 @@ TABLES = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tables", nargs="+", default=list(TABLES), choices=list(TABLES))
-    parser.add_argument("--count", type=int, help="loads, fewer than the table's, for a look")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found, body = recorded(arguments.name), beam()
-    for name in arguments.tables:
-        run, count = TABLES[name]
-        if name not in found:
-            with threadpool_limits(1):
-                found[name] = run(body, arguments.count or count)
-            write(arguments.name, found)
-        print(name, found[name], sep="\n  ", flush=True)
+def work(row: str, given: Given) -> dict[str, Any]:
+    run_table, count = TABLES[row]
+    return run_table(beam(), given.count or count)
+
+
+_CONTROLS = {
+    "stiffness": ("modulus_off", "within_1e-8"),
+    "ratio": ("ratio_off", "within_1e-5"),
+    "both": ("modulus_off", "within_1e-5"),
+}
+
+
+def lines(rows: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """What is off at the end, in the mean and at most, one line for each control and start."""
+    for name, found in rows.items():
+        if name == "exactness":
+            asked = f"{100 * found['share_within_1e-9']:.0f} % of nodes' largest"
+            yield name, {**found["distance"], "loads": found["loads"], "asked": asked,
+                         "seconds": found["seconds_a_load"]["layer"]}  # fmt: skip
+        elif name in _CONTROLS:
+            off, asked = _CONTROLS[name]
+            yield name, {**found["found"], "off": found["found"][off], "loads": found["loads"],
+                         "asked": found[asked], "seconds": found["seconds"]}  # fmt: skip
+        elif name == "force":
+            asked = f"all but {len(found['failed'])} of {found['loads']}"
+            for start, each in found["starts"].items():
+                yield f"force from {start}", {**each, "off": each["force_off"], "loads": found["loads"] // 2,
+                                              "asked": asked, "seconds": found["seconds"]}  # fmt: skip
+
+
+BENCHMARK = Benchmark(
+    name="inverse",
+    title="The thesis's differentiable engine (section 7.2): exactness; force, stiffness and ratio as controls",
+    about=("registration", "reference"),
+    work=work,
+    rows=lambda given: given.tables,
+    columns=(
+        Column("loads", "", "{loads}"),
+        Column("as asked", "", "{asked}"),
+        Column("mean nodal (largest)", "m", "{mean.mean:.1e} ({mean.largest:.1e})"),
+        Column("norm / nodes", "m", "{norm_over_nodes.mean:.1e}"),
+        Column("control off, relative", "", "{off.mean:.1e} ({off.largest:.1e})"),
+        Column("a load", "s", "{seconds:.2f}"),
+    ),
+    settings={
+        "tables": Setting(tuple(TABLES), choices=tuple(TABLES), picks=True),
+        "count": Setting(None, "loads, fewer than the table's, for a look", kind=int),
+    },
+    seeds=(0,),
+    small={"count": 2},
+    lines=lines,
+    also=("inverse_exactness",),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -8,11 +8,11 @@ settings after equal wall time. The data are those of networks_bodies.py.
 
 from __future__ import annotations
 
-import argparse
 from typing import Any
 
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
 from networks_bodies import data_of
-from record import recorded, write
 
 from softtwin.meshes.metrics import relative_error
 from softtwin.reference.data.dataset import DataSet
@@ -41,30 +41,36 @@ def floor(data: DataSet, modes: int) -> dict[str, Any]:
     return vars(spread(relative_error(best, test.displacements)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--body", default="beam", help="a case of networks_bodies.py")
-    parser.add_argument("--seconds", type=float, default=100.0)
-    parser.add_argument("--ranks", type=int, default=2)
-    arguments = parser.parse_args()
-    name = f"learning_limits_{arguments.body}"
-    found = recorded(name)
-    data = data_of(arguments.body, arguments.ranks)
-    found["floor"] = {str(modes): floor(data, modes) for modes in (64, 128, 192)}
-    for modes, values in found["floor"].items():
-        print(f"{modes} modes could be {100 * values['median']:.4f} (95 % {100 * values['p95']:.3f}) % off", flush=True)
-    for label, settings in SETTINGS.items():
-        key = f"{label}, {arguments.seconds:g} s"
-        if key not in found:
-            surrogate = train(data, TrainingPlan(settings, seconds=arguments.seconds))
-            found[key] = {"steps": surrogate.card["training"]["steps"]}
-            for split in ("train", "test"):
-                found[key][split] = evaluate(surrogate, data, split, COUNT).as_dict()
-            write(name, found)
-        for split in ("train", "test"):
-            error, relative = (found[key][split][word] for word in ("nodal_error", "relative_error"))
-            print(f"{key}, {split}: e {1e3 * error['mean']:.4g} mm, {100 * relative['median']:.3f} % off", flush=True)
+def work(row: str, given: Given) -> dict[str, Any]:
+    data = given.once(data_of, given.body, given.ranks)
+    if row == "floor":
+        return {str(modes): floor(data, modes) for modes in (64, 128, 192)}
+    surrogate = train(data, TrainingPlan(SETTINGS[row.rpartition(",")[0]], seconds=given.seconds))
+    judged = {split: evaluate(surrogate, data, split, COUNT).as_dict() for split in ("train", "test")}
+    return {"steps": surrogate.card["training"]["steps"], **judged}
+
+
+BENCHMARK = Benchmark(
+    name="learning_limits_{body}",
+    title="What limits the reduced network on a body: its modes, its samples, or what it makes of both",
+    about=("surrogate",),
+    work=work,
+    rows=lambda given: ["floor", *(f"{label}, {given.seconds:g} s" for label in SETTINGS)],
+    columns=tuple(
+        Column(
+            f"{split}: mean nodal, mm; relative, %",
+            "",
+            f"{{{split}.nodal_error.mean*1000:.3f}}; {{{split}.relative_error.median*100:.3f}}",
+        )
+        for split in ("train", "test")
+    ),
+    settings={
+        "body": Setting("beam", "a case of networks_bodies.py"),
+        "seconds": Setting(100.0, "of training"),
+        "ranks": RANKS,
+    },
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -1,6 +1,6 @@
 """How far the linear response of 512 modes is from the whole one, with and without knowing the loads that are drawn.
 
-    python benchmarks/linear_response.py [--bodies liver-grid phantom]
+    python benchmarks/linear_response.py [--only "loose corners" ...]
 
 On the real liver's sparse grid and on the tetrahedra of the phantom: relative errors of the displacement at rest under
 held-out drawn loads, smooth forces within 4 cm, and forces of random sign at every node. Then how many ranks the whole
@@ -10,14 +10,14 @@ what a Jacobian of 64 modes costs beside its equilibrium (the beam of 304 hexahe
 
 from __future__ import annotations
 
-import argparse
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from harness import Benchmark, run
 from networks_bodies import LIVER, liver
 from numpy.typing import NDArray
-from record import write
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import outer
@@ -123,21 +123,22 @@ def jacobian_cost() -> dict[str, float]:
     return {"equilibrium_s": float(np.median(solve_s)), "jacobian_s": float(np.median(jacobian_s))}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bodies", nargs="+", default=["liver-grid", "phantom"])
-    bodies = {"liver-grid": liver, "phantom": liver_phantom}
-    figures: dict[str, Any] = {}
-    for name in parser.parse_args().bodies:
-        figures[name] = missed(bodies[name](), PLANS[name])
-        print(name, {k: v if isinstance(v, int) else f"{100 * v['median']:.3g} ({100 * v['max']:.3g}) %"
-                     for k, v in figures[name].items()}, flush=True)  # fmt: skip
-    figures["ranks"] = {"beam": ranks(beam(), LoadPlan()), "phantom": ranks(liver_phantom(), PLANS["phantom"])}
-    figures["loose corners"] = loose_corners()
-    figures["cost on the beam"] = jacobian_cost()
-    print(figures["ranks"], figures["loose corners"], figures["cost on the beam"])
-    write("linear_response", figures)
+STUDIES: dict[str, Callable[[], dict[str, Any]]] = {
+    "liver-grid": lambda: missed(liver(), PLANS["liver-grid"]),
+    "phantom": lambda: missed(liver_phantom(), PLANS["phantom"]),
+    "ranks": lambda: {"beam": ranks(beam(), LoadPlan()), "phantom": ranks(liver_phantom(), PLANS["phantom"])},
+    "loose corners": loose_corners,
+    "cost on the beam": jacobian_cost,
+}
+BENCHMARK = Benchmark(
+    name="linear_response",
+    title="How far a linear response of 512 modes is from the whole one, and what the whole one costs",
+    about=("reference",),
+    work=lambda row, given: STUDIES[row](),
+    rows=tuple(STUDIES),
+    seeds=(0, 1),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

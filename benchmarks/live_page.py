@@ -1,7 +1,7 @@
 """The live page as a browser receives it: vertex updates a second, pull to answer, memory over time, five browsers.
 
-python benchmarks/live_page.py                 600 seconds of the demo in headless Chromium (Debian's chromium)
-python benchmarks/live_page.py --seconds 60    a shorter look
+    python benchmarks/live_page.py                 600 seconds of the demo in headless Chromium (Debian's chromium)
+    python benchmarks/live_page.py --seconds 60    a shorter look
 
 Software rendering draws three to twelve pictures a second, so that what is counted is what the browser receives:
 messages on its websocket that move the organ's vertices. A pull is timed from the message with the mouse's place, which
@@ -10,8 +10,6 @@ the library sends at most every 50 ms, to the next one that moves the organ, bot
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import signal
 import subprocess
@@ -26,8 +24,10 @@ from typing import Any
 import msgspec
 import numpy as np
 import zstandard
+from columns import Column, cell
+from harness import Benchmark, Setting, run
 from playwright.sync_api import Browser, Page, sync_playwright
-from record import write
+from summaries import resident_mib
 
 CHROMIUM = Path("/usr/bin/chromium")
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
@@ -153,12 +153,6 @@ def rate(heard: Heard, page: Page, seconds: float) -> float:
     return (len(heard.updates) - before) / (time.monotonic() - begin)
 
 
-def memory(process: int) -> float:
-    """Resident memory of a process, MiB."""
-    status = Path(f"/proc/{process}/status").read_text()
-    return int(status.split("VmRSS:")[1].split()[0]) / 1024
-
-
 def cpu_seconds(process: int) -> float:
     """Processor time that a process has used."""
     fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
@@ -191,7 +185,7 @@ def measured(seconds: float) -> dict[str, Any]:
         course = []
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            course.append(memory(process.pid))
+            course.append(resident_mib(process.pid))
             page.wait_for_timeout(min(10_000, 1000 * seconds / 6))
         browser.close()
         time.sleep(2.0)
@@ -213,14 +207,37 @@ def measured(seconds: float) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Measures, prints and writes."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--seconds", type=float, default=600.0, help="over which memory is watched")
-    figures = measured(parser.parse_args().seconds)
-    print(json.dumps(figures, indent=1))
-    write("live_page", figures)
+ASKED = {
+    "page served; first vertices there, s": ("{seconds_to_page:.1f}; {seconds_to_first_update:.1f}", "15"),
+    "vertex updates a second that the browser receives": ("{updates_a_second:.1f}", "30"),
+    "pull to answer (95 %), ms": ("{pull_to_answer_ms.median:.0f} ({pull_to_answer_ms.p95:.0f})", "95 %: 100"),
+    "five browsers, updates a second, the least": ("{five_least:.1f}", "at once"),
+    "resident memory: first, middle, last, MiB": (
+        "{memory_mib.first:.0f}; {memory_mib.middle:.0f}; {memory_mib.last:.0f}",
+        "flat",
+    ),
+    "cores used with no browser": ("{cores_used_with_no_browser:.2f}", "-"),
+}
+
+
+def lines(figures: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A line for each figure."""
+    told = {**figures, "five_least": min(figures["five_browsers_updates_a_second"])}
+    for label, (reached, asked) in ASKED.items():
+        yield label, {"reached": cell(Column("", "", reached), told), "asked": asked}
+
+
+BENCHMARK = Benchmark(
+    name="live_page",
+    title="The live page as a browser receives it: updates, pull to answer, memory, five browsers",
+    about=("app",),
+    work=lambda row, given: measured(given.seconds),
+    columns=(Column("reached", "", "{reached}"), Column("asked", "", "{asked}")),
+    settings={"seconds": Setting(600.0, "over which memory is watched")},
+    small={"seconds": 12.0},
+    lines=lines,
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

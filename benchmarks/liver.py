@@ -28,6 +28,12 @@ class Sequence:
     tool: Ints
     zone: Ints
 
+    def nodal_forces(self, frame: int, share: float = 1.0) -> Floats:
+        """A share of the true forces of a frame, spread evenly over the tool's nodes, (n, 3), newtons."""
+        forces = np.zeros_like(self.positions[0])
+        forces[self.tool] = share * self.net_forces[frame] / len(self.tool)
+        return forces
+
 
 def liver(mesh: str = "default", attachment: str = "facets") -> Body:
     """The liver as a body with the observed side as surface `observed` and zones `s1`, `s2`, `s3`.

@@ -1,22 +1,18 @@
 """The real liver by three engines, on another mesh, and with a wrong organ (figures 6.11 to 6.14 of the thesis).
 
-    python benchmarks/liver_engines.py [--twin TWIN] [--rows ...] [--frames 50] [--pictures FOLDER]
+    python benchmarks/liver_engines.py [--twin TWIN] [--only ROW ...] [--frames 50]
+    python benchmarks/liver_engines.py pictures FOLDER TWIN
 
 Sequences s1, s2, s3, the zone told, the noise not; frame 0 from rest and given apart, each later frame from the one
 before. `hybrid` is the reference from where the surrogate has been. On mesh-remeshed the truth's nodes are carried by
 the other mesh's cells. `wrong` rows register with another organ than the truth's: stiffer, softer, Poisson's ratio 0.45
 for 0.49, or a linear law. With doubt, margins know of alternatives (`softtwin doubt`): what holds the organ lies
 elsewhere by some 4 mm, its ratio is 0.42 to 0.49, it is meshed otherwise, and its modulus may be 30 % off. Covered is
-the share of nodes whose error lies within the margin, and of net forces within their region. Rows are written as they
-are finished; the same command goes on with those that are missing.
+the share of nodes whose error lies within the margin, and of net forces within their region.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -24,16 +20,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from columns import Column, shares, verdicts
+from harness import RANKS, Benchmark, Given, Setting, run, started
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequence
-from networks import RUNS
 from numpy.typing import NDArray
-from record import recorded, stamp, write
+from record import RUNS
 from scipy.stats import chi2
+from summaries import counts, predicted_mm
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import Embedding, embed
-from softtwin.reference.alternatives import Alternatives, differences
 from softtwin.reference.data.dataset import existing
 from softtwin.reference.data.discrepancy import Discrepancy, discrepancy_of, read_discrepancy, write_discrepancy
 from softtwin.reference.data.materials import LinearElastic, Material, NeoHookean
@@ -42,10 +39,11 @@ from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.fem.fenicsx import MPI
 from softtwin.reference.generate import Plan, generate
+from softtwin.reference.model_error import ModelErrorEnsemble, differences
 from softtwin.reference.solve.problem import NewtonOptions, Problem
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.hybrid import HybridRegistrar
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import NOISE, expected_force, options_for
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.result import Registration
@@ -54,10 +52,9 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.twin import load as load_twin
 
 Floats = NDArray[np.float64]
-NAME = "liver_engines"
 SHARES = (0.5, 0.9, 0.95)
 LOOSE = NewtonOptions(tolerance=1e-5, max_iterations=15)
-DOUBT = Alternatives(attachment=0.004, poisson_ratio=(0.42, 0.49), meshes=3)
+DOUBT = ModelErrorEnsemble(attachment=0.004, poisson_ratio=(0.42, 0.49), meshes=3)
 DRAWS, LOADS, MODULUS_OFF = 96, 48, 0.3
 
 
@@ -111,10 +108,7 @@ def doubt_of(mesh: str, ranks: int) -> Discrepancy:
     folder = RUNS / f"liver-doubt-{mesh}"
     file = folder / "doubt.npz"
     if not file.exists():
-        command = [sys.executable, __file__, "--draw", mesh]
-        if ranks > 1:
-            command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), *command]
-        subprocess.run(command, check=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+        started(__file__, "draw", mesh, ranks=ranks)
     return read_discrepancy(file, liver(mesh))[0]
 
 
@@ -153,7 +147,7 @@ def registrars(row: Row, twin: Path, ranks: int) -> Iterator[dict[str, Registrar
         def alone(model: ForwardModel, zone: NDArray[np.int64]) -> Registrar:
             options = options_for(model, has_zone=True)
             if row.noise is not None:
-                options = replace(options, noise=Scale(row.noise, NOISE.spread, least=row.noise))
+                options = replace(options, noise=LogNormalPrior(row.noise, NOISE.spread, minimum=row.noise))
             return prepare(
                 model,
                 zone,
@@ -185,7 +179,7 @@ def figures(
         "sequence": data.name,
         "frame": frame,
         "tre_mm": 1e3 * float(errors.mean()),
-        "predicted_mm": 1e3 * float(np.sqrt(8.0 / (3.0 * np.pi)) * known.deviation.mean()),
+        "predicted_mm": predicted_mm(known),
         "force_error": float(np.linalg.norm(missed)) / size if size > 0.0 else None,
         "z2": float(missed @ np.linalg.solve(result.net_force_covariance, missed) / 3.0),
         "covered": {str(share): float((errors <= known.margin(carrier, share) + 1e-12).mean()) for share in SHARES},
@@ -200,7 +194,7 @@ def figures(
     return found
 
 
-def run(row: Row, twin: Path, ranks: int, frames: int) -> list[dict[str, Any]]:
+def run_row(row: Row, twin: Path, ranks: int, frames: int) -> list[dict[str, Any]]:
     """All frames of all sequences; a frame without a state is counted as failed."""
     rest, rows = liver().points, []
     with registrars(row, twin, ranks) as each:
@@ -225,11 +219,10 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     done = [row for row in rows if "failed" not in row]
     warm, cold = ([row for row in done if (row["frame"] > 0) is later] for later in (True, False))
     squares = np.array([3.0 * row["z2"] for row in done])
-    verdicts = [row["verdict"] for row in done]
     found: dict[str, Any] = {
         "frames": len(rows),
         "failed": len(rows) - len(done),
-        "verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))},
+        "verdicts": counts(row["verdict"] for row in done),
         "tre_mm": {
             name: float(np.mean([row["tre_mm"] for row in warm if row["sequence"] == name])) for name in SEQUENCES
         },
@@ -260,9 +253,7 @@ def pictures(folder: Path, twin: Path, frames: tuple[int, ...] = (5, 20, 40), na
     data, body = sequence(name), liver()
     shown: dict[str, list[tuple[Floats, Floats]]] = {"truth": [], "reference": [], "surrogate": []}
     for frame in frames:
-        forces = np.zeros_like(body.points)
-        forces[data.tool] = data.net_forces[frame] / len(data.tool)
-        shown["truth"].append((data.positions[frame], forces))
+        shown["truth"].append((data.positions[frame], data.nodal_forces(frame)))
     for engine in ("reference", "surrogate"):
         with registrars(ROWS[engine], twin, 1) as each:
             for frame in frames:
@@ -295,31 +286,45 @@ def _draw(plotter: Any, body: Body, points: Floats, forces: Floats) -> None:
     plotter.add_mesh(arrows.glyph(orient="force", scale="force", factor=1.0), color="#1f4e8c")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--twin", type=Path, default=RUNS / "liver" / "twin")
-    parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=list(ROWS))
-    parser.add_argument("--frames", type=int, default=50)
-    parser.add_argument("--ranks", type=int, default=2, help="that draw alternatives")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    parser.add_argument("--pictures", type=Path, help="draw nodal forces into this folder, and end")
-    parser.add_argument("--draw", default="", help="make the alternatives of this mesh alone, and end")
-    arguments = parser.parse_args()
-    if arguments.draw:
-        draw_doubt(arguments.draw)
-        return
-    found = recorded(arguments.name)
+def work(row: str, given: Given) -> dict[str, Any]:
+    rows = run_row(ROWS[row], given.twin, given.ranks, given.frames)
+    return {"summary": summary(rows), "rows": rows}
+
+
+def picture(folder: str, twin: str) -> None:
+    """Draw nodal forces into a folder (figure 6.12)."""
     with threadpool_limits(1):
-        if arguments.pictures:
-            pictures(arguments.pictures, arguments.twin)
-            return
-        for name in arguments.rows:
-            if name not in found:
-                rows = run(ROWS[name], arguments.twin, arguments.ranks, arguments.frames)
-                found[name] = {"summary": summary(rows), "rows": rows, "made": stamp()}
-                write(arguments.name, found)
-            print(name, found[name]["summary"], flush=True)
+        pictures(Path(folder), Path(twin))
+
+
+BENCHMARK = Benchmark(
+    name="liver_engines",
+    title="The real liver by three engines, on another mesh, with a wrong organ (figures 6.11 to 6.14)",
+    about=("registration", "surrogate", "reference"),
+    work=work,
+    rows=tuple(ROWS),
+    columns=(
+        Column("frames: accepted; doubtful; refused", "", lambda f: f"{f['frames']}: {verdicts(f)}"),
+        Column("failed", "", "{failed}"),
+        Column(
+            "TRE: s1; s2; s3 (worst)", "mm", "{tre_mm.s1:.3f}; {tre_mm.s2:.3f}; {tre_mm.s3:.3f} ({worst_tre_mm:.2f})"
+        ),
+        Column("predicted", "mm", "{predicted_mm:.3f}"),
+        Column("force", "%", "{force_error*100:.1f}"),
+        Column("nodes covered by 50 / 90 / 95 % margins", "%", lambda f: shares(f["covered"])),
+        Column("net force", "%", lambda f: shares(f["force_covered"])),
+        Column("median (longest)", "s", "{median_seconds:.3f} ({longest_seconds:.2f})"),
+        Column("cold", "s", lambda f: " / ".join(f"{seconds:.2f}" for seconds in f["cold"]["seconds"])),
+    ),
+    settings={
+        "twin": Setting(RUNS / "liver" / "twin", "that registration_surrogate.py makes", picks=True),
+        "frames": Setting(50, "of each sequence, at most"),
+        "ranks": RANKS,
+    },
+    small={"frames": 2},
+    lines=lambda rows: ((name, found["summary"]) for name, found in rows.items()),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK, parts={"draw": draw_doubt, "pictures": picture})

@@ -8,10 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from columns import Column
+from harness import Benchmark, Given, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequence
-from numpy.typing import NDArray
-from record import write
-from threadpoolctl import threadpool_limits
 
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.solve.problem import Problem
@@ -20,18 +19,11 @@ MATERIAL = NeoHookean(YOUNG_MODULUS, POISSON_RATIO)
 FRAMES = (0, 25, 49)
 
 
-def tool_forces(data: Sequence, frame: int) -> NDArray[np.float64]:
-    """The true nodal forces of a frame, (n, 3)."""
-    forces = np.zeros_like(data.positions[0])
-    forces[data.tool] = data.net_forces[frame] / len(data.tool)
-    return forces
-
-
 def imbalance(problem: Problem, data: Sequence) -> float:
     """Largest force that is left on a free node over all frames, newtons."""
     largest = 0.0
     for frame, positions in enumerate(data.positions):
-        gap = problem.internal_forces(positions - problem.body.points) - tool_forces(data, frame)
+        gap = problem.internal_forces(positions - problem.body.points) - data.nodal_forces(frame)
         largest = max(largest, float(np.linalg.norm(gap[problem.body.free], axis=1).max()))
     return largest
 
@@ -42,7 +34,7 @@ def attachments(data: Sequence) -> dict[str, Any]:
     for name in ("listed", "facets"):
         body = liver(attachment=name)
         with Problem(body, MATERIAL) as problem:
-            forces = tool_forces(data, 0)
+            forces = data.nodal_forces(0)
             cold = problem.solve(forces)
             warm = problem.solve(forces, guess=data.positions[0] - body.points)
             found[name] = (cold, float(np.abs(cold.displacement - warm.displacement).max()))
@@ -56,34 +48,39 @@ def attachments(data: Sequence) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    listed = liver(attachment="listed")
-    lone = np.setdiff1d(listed.fixed, liver().fixed)
-    figures: dict[str, Any] = {
+def in_balance(row: str, given: Given) -> dict[str, Any]:
+    """Of one sequence: what is left on its free nodes, what a solve from rest finds, both readings of what is fixed."""
+    data, listed = sequence(row), given.once(liver, "default", "listed")
+    problem = given.opened(Problem, given.once(liver), MATERIAL)
+    lone = np.setdiff1d(listed.fixed, problem.body.fixed)
+    errors = {}
+    for frame in FRAMES:
+        state = problem.solve(data.nodal_forces(frame))
+        errors[f"{row} {frame}"] = np.abs(problem.body.points + state.displacement - data.positions[frame]).max()
+        print(f"{row} {frame}: {state.load_steps} load step, {state.negative_pivots} negative pivots")
+    return {
         "lone_nodes": lone,
-        "lone_movement_mm": {},
-        "largest_imbalance_N": {},
-        "largest_error_m": {},
-        "attachments": {},
+        "lone_movement_mm": 1e3 * np.linalg.norm(data.positions[0, lone] - listed.points[lone], axis=1),
+        "largest_imbalance_N": imbalance(problem, data),
+        "largest_error_m": errors,
+        "attachments": attachments(data),
     }
-    with threadpool_limits(1), Problem(liver(), MATERIAL) as problem:
-        for name in SEQUENCES:
-            data = sequence(name)
-            moved = np.linalg.norm(data.positions[0, lone] - listed.points[lone], axis=1)
-            figures["lone_movement_mm"][name] = 1e3 * moved
-            figures["largest_imbalance_N"][name] = imbalance(problem, data)
-            for frame in FRAMES:
-                state = problem.solve(tool_forces(data, frame))
-                error = np.abs(problem.body.points + state.displacement - data.positions[frame]).max()
-                figures["largest_error_m"][f"{name} {frame}"] = error
-                found = f"{state.load_steps} load step, {state.negative_pivots} negative pivots"
-                print(f"{name} {frame}: {error:.1e} m, {found}")
-            figures["attachments"][name] = attachments(data)
-            print(
-                name, {key: value[name] for key, value in figures.items() if isinstance(value, dict) and name in value}
-            )
-    write("liver_truth", figures)
+
+
+BENCHMARK = Benchmark(
+    name="liver_truth",
+    title="Whether the real liver's stored states are equilibria, and found from rest",
+    about=("reference",),
+    work=in_balance,
+    rows=SEQUENCES,
+    columns=(
+        Column("largest force left on a free node", "N", "{largest_imbalance_N:.1e}"),
+        Column("found from rest: largest error", "m", lambda f: f"{max(f['largest_error_m'].values()):.1e}"),
+        Column("node 756 moves", "mm", "{lone_movement_mm.0:.2f}"),
+        Column("with it fixed: largest gap", "mm", "{attachments.largest_gap_mm:.2f}"),
+    ),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

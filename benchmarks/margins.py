@@ -1,7 +1,7 @@
 """Margins of where structures are: how often they cover the truth, and how well the predicted error tells the true one.
 
     softtwin quickstart --output FOLDER
-    python benchmarks/margins.py FOLDER [--loads 200] [--engines surrogate hybrid]
+    python benchmarks/margins.py FOLDER [--loads 200] [--only surrogate ...]
 
 States of the quickstart's organ under loads of its kind that no data set holds, solved by the reference; clouds of
 1,000 points from the quickstart's camera, no zone told, from rest. One row has another Poisson's ratio than the twin.
@@ -14,15 +14,14 @@ were true: with errors drawn from each frame's own posterior. No better one can 
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from columns import Column, shares
+from harness import FOLDER, Benchmark, Given, Setting, run
 from numpy.typing import NDArray
-from record import recorded, stamp, write
-from threadpoolctl import threadpool_limits
+from summaries import predicted_mm
 
 from softtwin.app.quickstart import CAMERA, POINTS
 from softtwin.app.twin import Twin
@@ -36,7 +35,6 @@ from softtwin.registration.uncertainty import Uncertainty
 from softtwin.registration.verdict import Verdict
 
 Floats = NDArray[np.float64]
-NAME = "margins"
 FRESH = 1_000_000  # numbers of loads begin here: none of them is in a data set
 SHARES = (0.5, 0.9, 0.95)
 # Noise in metres, the Poisson's ratio that the truth has where it is not the twin's, and whether the pose is exact.
@@ -78,7 +76,7 @@ def one(twin: Twin, truth: Floats, noise: float, seed: int) -> dict[str, Any]:
     kept["moved_mm"] = 1e3 * float(np.linalg.norm(truth, axis=1).max())
     kept["nodes"] = {
         "error_mm": 1e3 * float(lengths.mean()),
-        "predicted_mm": 1e3 * float(np.sqrt(8.0 / (3.0 * np.pi)) * known.deviation.mean()),  # mean of a normal's length
+        "predicted_mm": predicted_mm(known),
         "covered": {share: float((lengths <= known.margin(None, share) + 1e-12).mean()) for share in SHARES},
         "drawn_mm": (1e3 * drawn(known, rng)).tolist(),
     }
@@ -147,29 +145,38 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--loads", type=int, default=200)
-    parser.add_argument("--engines", nargs="+", default=["surrogate", "hybrid"])
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found = recorded(arguments.name)
-    data = DataSet(arguments.folder / "data.zarr")
-    for label, (noise, poisson_ratio, is_exact) in ROWS.items():
-        states: list[Floats] = []
-        options: dict[str, Any] = {"pose": "fixed"} if is_exact else {}
-        for engine in arguments.engines:
-            key = f"{engine}, {label}"
-            if key not in found:
-                states = states or [state for _, state in truths(data, arguments.loads, poisson_ratio)]
-                with threadpool_limits(1), Twin.open(arguments.folder, engine, **options) as twin:
-                    rows = [one(twin, truth, noise, i) for i, truth in enumerate(states)]
-                found[key] = {"summary": summary(rows), "made": stamp()}
-                write(arguments.name, found)
-            told = {name: value for name, value in found[key]["summary"].items() if name != "structures"}
-            print(key, json.dumps(told), json.dumps(found[key]["summary"]["structures"]), sep="\n  ", flush=True)
+def truths_of(folder: Path, count: int, poisson_ratio: float | None = None) -> list[tuple[Floats, Floats]]:
+    """Loads and states of a quickstart's data set that are not in it."""
+    return truths(DataSet(folder / "data.zarr"), count, poisson_ratio)
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    engine, label = row.split(", ", 1)
+    noise, poisson_ratio, is_exact = ROWS[label]
+    pairs = given.once(truths_of, given.folder, given.loads, poisson_ratio)
+    with Twin.open(given.folder, engine, **({"pose": "fixed"} if is_exact else {})) as twin:
+        return {"summary": summary([one(twin, truth, noise, i) for i, (_, truth) in enumerate(pairs)])}
+
+
+BENCHMARK = Benchmark(
+    name="margins",
+    title="How often margins cover the truth, and how well the predicted error tells the true one",
+    about=("registration", "surrogate", "reference"),
+    work=work,
+    rows=tuple(f"{engine}, {label}" for label in ROWS for engine in ("surrogate", "hybrid")),
+    columns=(
+        Column("error; predicted", "mm", "{error_mm:.2f}; {predicted_mm:.2f}"),
+        Column("r; at best", "", "{correlation:.2f}; {correlation_at_best:.2f}"),
+        Column("nodes covered by 50 / 90 / 95 % margins", "%", lambda f: shares(f["nodes_covered"])),
+        Column("tumour", "%", lambda f: shares(f["structures"]["tumour"]["covered"])),
+        Column("its 95 % margin", "mm", "{structures.tumour.margin95_mm:.2f}"),
+        Column("median", "s", "{median_seconds:.2f}"),
+    ),
+    settings={"folder": FOLDER, "loads": Setting(200, "that no data set holds")},
+    small={"loads": 2},
+    lines=lambda rows: ((name, found["summary"]) for name, found in rows.items()),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

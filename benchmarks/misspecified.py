@@ -1,7 +1,7 @@
 """What registration says of its doubt where the organ is not what the twin takes it for.
 
     softtwin quickstart --output FOLDER
-    python benchmarks/misspecified.py FOLDER [--truths 200] [--kinds ...] [--engines ...]
+    python benchmarks/misspecified.py FOLDER [--truths 200] [--only ROW ...]
 
 States of the quickstart's organ under one pull at a patch of 20 mm of the side that is seen, by a reference that is
 stiffer or softer, less or more compressible, held elsewhere, or meshed anew; clouds of 1,000 points from the
@@ -14,8 +14,6 @@ With `--no-doubt` margins know of no alternatives of the organ (`softtwin doubt`
 
 from __future__ import annotations
 
-import argparse
-import json
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,14 +21,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from columns import Column, shares
+from harness import FOLDER, Benchmark, Given, Setting, run
 from numpy.typing import NDArray
-from record import recorded, write
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from threadpoolctl import threadpool_limits
 
 from softtwin.app.quickstart import CAMERA, POINTS
-from softtwin.app.twin import DOUBT, find_twin
+from softtwin.app.twin import MODEL_ERROR, find_twin
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import embed
@@ -42,7 +40,6 @@ from softtwin.registration.pose import Pose
 from softtwin.registration.verdict import Verdict
 
 Floats = NDArray[np.float64]
-NAME, WITHOUT = "misspecified_doubt", "misspecified"
 NOISE, PATCH, MODULUS, RATIO = 5e-4, 0.02, 5000.0, 0.45
 SHARES = (0.5, 0.9, 0.95)
 _WAVES = 300
@@ -184,7 +181,7 @@ def one(twin: Any, truth: Floats, net: Floats, cloud: Floats) -> dict[str, Any]:
         },
         "z2": float(off @ np.linalg.solve(result.net_force_covariance, off) / 3.0),
         "force_off": float(np.linalg.norm(off) / np.linalg.norm(net)),
-        "alike": result.alike,
+        "alike": result.inflation_factor,
         "seconds": result.seconds,
     }
 
@@ -209,31 +206,6 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--truths", type=int, default=200)
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
-    parser.add_argument("--engines", nargs="+", default=list(ENGINES), choices=list(ENGINES))
-    parser.add_argument("--no-doubt", action="store_true", help="margins know of no alternatives of the organ")
-    parser.add_argument("--name", help="of the record")
-    arguments = parser.parse_args()
-    name = arguments.name or (WITHOUT if arguments.no_doubt else NAME)
-    found, home = recorded(name), find_twin(arguments.folder)
-    if not (arguments.no_doubt or (home.folder / DOUBT).is_file()):
-        parser.error(f"{arguments.folder}: expected what `softtwin doubt` makes, found none; make it, or --no-doubt")
-    for kind in arguments.kinds:
-        states: list[tuple[Floats, Floats, Floats]] = []
-        for engine in arguments.engines:
-            key = f"{engine}: {kind}"
-            if key not in found and not (engine == _LINEAR and kind != "as it is"):
-                states = states or list(truths(home.body, kind, arguments.truths))
-                found[key] = measured(arguments.folder, engine, states, not arguments.no_doubt)
-                write(name, found)
-            if key in found:
-                print(key, json.dumps(found[key]), sep="\n  ", flush=True)
-
-
 def measured(folder: Path, engine: str, states: list[tuple[Floats, Floats, Floats]], doubt: bool) -> dict[str, Any]:
     """One row."""
     home = find_twin(folder)
@@ -243,11 +215,53 @@ def measured(folder: Path, engine: str, states: list[tuple[Floats, Floats, Float
     with tempfile.TemporaryDirectory() as kept:
         place = Path(shutil.copytree(home.folder, Path(kept) / "twin"))
         if not doubt or engine == _LINEAR:  # what it may be otherwise is of another law
-            (place / DOUBT).unlink(missing_ok=True)
+            (place / MODEL_ERROR).unlink(missing_ok=True)
         home = type(home)(place, home.body, home.config.model_copy(update={"material": material}))
-        with threadpool_limits(1), home.twin(**ENGINES[engine]) as twin:
+        with home.twin(**ENGINES[engine]) as twin:
             return summary([one(twin, *state) for state in states])
 
 
+ROWS = tuple(f"{e}: {kind}" for kind in KINDS for e in ENGINES if e != _LINEAR or kind == "as it is")
+
+
+def states_of(folder: Path, kind: str, count: int) -> list[tuple[Floats, Floats, Floats]]:
+    """True states of a kind."""
+    return list(truths(find_twin(folder).body, kind, count))
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    engine, kind = row.split(": ")
+    if not given.no_doubt and not (find_twin(given.folder).folder / MODEL_ERROR).is_file():
+        raise SystemExit(f"{given.folder}: expected what `softtwin doubt` makes, found none; make it, or --no-doubt")
+    states = given.once(states_of, given.folder, kind, given.truths)
+    return measured(given.folder, engine, states, not given.no_doubt)
+
+
+BENCHMARK = Benchmark(
+    name="misspecified_doubt",
+    title="What registration says of its doubt where the organ is not what the twin takes it for",
+    about=("registration", "surrogate", "reference"),
+    work=work,
+    rows=ROWS,
+    columns=(
+        Column("accepted; refused of", "", "{accepted*100:.0f} %; {refused} of {truths}"),
+        Column("error; predicted", "mm", "{error_mm:.2f}; {predicted_mm:.2f}"),
+        Column("nodes covered by 50 / 90 / 95 % margins", "%", lambda f: shares(f["nodes"])),
+        Column("inner", "%", lambda f: shares(f["structures"])),
+        Column("force", "%", lambda f: shares(f["force"])),
+        Column("z rms", "", "{z_rms:.2f}"),
+        Column("median", "s", "{median_seconds:.2f}"),
+    ),
+    settings={
+        "folder": FOLDER,
+        "truths": Setting(200, "of each kind"),
+        "no_doubt": Setting(False, "margins know of no alternatives of the organ"),
+    },
+    small={"truths": 1},
+    also=("misspecified",),
+    named=lambda options: "misspecified" if options.no_doubt else "misspecified_doubt",
+)
+
+
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

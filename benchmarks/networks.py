@@ -12,10 +12,10 @@ written as it is finished; the same command goes on with the rows that are missi
 
 from __future__ import annotations
 
-import argparse
+import math
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -23,20 +23,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from columns import Column
+from harness import RANKS, Benchmark, Given, Setting, run
+from made import beam_data
 from numpy.typing import NDArray
-from record import recorded, stamp, write
+from record import RUNS
 
-from softtwin.app.chain import prepare
-from softtwin.app.config import Config
-from softtwin.app.launch import generate_in_parallel
-from softtwin.app.stages.mesh import mesh_stage
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples, existing
 from softtwin.reference.data.jacobians import missing_jacobians
 from softtwin.surrogate.architecture import Architecture, Network
 from softtwin.surrogate.balance import balance
+from softtwin.surrogate.encoder_decoder import LinearEncoderDecoder
 from softtwin.surrogate.evaluate import evaluate, jacobian_errors, spread
-from softtwin.surrogate.maps import LinearMaps
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.physics import Physics
@@ -50,8 +49,6 @@ if TYPE_CHECKING:
     from softtwin.reference.solve.problem import Problem
 
 Floats = NDArray[np.float64]
-RUNS = Path(__file__).parent / "runs"
-NAME = "networks"
 JACOBIANS, PIVOTS = 20, 100  # samples whose Jacobian is compared, whose pivots are counted
 PROBES, MOST_COLUMNS = 64, 3000  # random loads that stand for the Jacobian's columns where these are more
 POD_MODES = 64
@@ -72,11 +69,7 @@ def data_of(kind: str, counts: dict[str, int], ranks: int, seed: int = 0, jacobi
         return made
     if jacobians and made is None and (plain / "data.zarr").exists():
         shutil.copytree(plain, folder)
-    config = Config.model_validate({"folder": ".", "body": {"source": "beam"}, "loads": loads, "samples": samples})
-    space = prepare(config, folder)
-    mesh_stage(space)
-    generate_in_parallel(folder / "organ.toml", ranks)
-    return DataSet(space.data)
+    return beam_data(folder, {"loads": loads, "samples": samples}, ranks)
 
 
 @dataclass(frozen=True)
@@ -200,7 +193,7 @@ def linear_map(data: DataSet, count: int | None = None) -> Surrogate:
         found.append((float(np.linalg.norm(loads @ tried.T @ modes.T - truth)), tried))
     to_coordinates = min(found, key=lambda pair: pair[0])[1]
     size, inputs = len(modes), forces.shape[1]
-    maps = LinearMaps(
+    maps = LinearEncoderDecoder(
         data.response.loaded, np.zeros(size), modes, to_coordinates, np.zeros((1, inputs)), np.zeros((size, 1))
     )
     return Surrogate(data.body, maps, _Nothing(), {"architecture": "linear map"})
@@ -237,7 +230,9 @@ def reference(data: DataSet) -> Iterator[Problem | None]:
         yield problem
 
 
-def run(row: Row, data: dict[str, DataSet], problem: Problem | None, learned: DataSet | None = None) -> dict[str, Any]:
+def trained(
+    row: Row, data: dict[str, DataSet], problem: Problem | None, learned: DataSet | None = None
+) -> dict[str, Any]:
     """Train, on other data than are judged where these are given, and judge one row."""
     began = time.perf_counter()
     own = learned or data[row.kind]
@@ -246,7 +241,7 @@ def run(row: Row, data: dict[str, DataSet], problem: Problem | None, learned: Da
     figures: dict[str, Any] = {"plan": None if row.plan is None else row.plan.entries(), "learned_from": row.kind}
     figures |= {"training": surrogate.card.get("training"), "samples": surrogate.card.get("samples"), "wall_s": seconds}
     figures["weights"] = sum(weights.numel() for weights in surrogate.network.parameters())
-    figures |= {"draws": draws_of(row, own), "made": stamp()}
+    figures["draws"] = draws_of(row, own)
     for kind, each in data.items():
         figures[kind] = judged(surrogate, each, problem, with_jacobian=kind == row.kind)
     return figures
@@ -259,83 +254,95 @@ def draws_of(row: Row, data: DataSet) -> int:
     return every if few is None else min(few, every)
 
 
-def is_made(key: str, found: dict[str, Any], draws: int) -> bool:
-    """Whether a record holds a row that learned from so many draws; one from another number is said, and made anew."""
-    if key not in found:
-        return False
-    learned, known = found[key].get("draws"), found[key].get("samples")
-    if learned is None and known is not None:  # rows of before have what was left of them
-        least = known["train"]
-        learned = min(max(draws, least), least + sum(known["rejected"].values()))
-    if learned is None or learned == draws:
-        return True
-    print(f"{key}: learned from {learned} draws, {draws} are asked for: made anew", flush=True)
-    return False
-
-
-def show(key: str, figures: dict[str, Any]) -> None:
-    """One row, as it is finished."""
-    own = figures[figures["learned_from"]]
-    sound = own["balance"]
-    others = [f"{kind}: e {1e3 * f['nodal_error']['mean']:.3f} mm" for kind, f in figures.items() if isinstance(f, dict)
-              and "nodal_error" in f and kind != figures["learned_from"]]  # fmt: skip
-    residual = "-" if sound["residual"] is None else f"{sound['residual']['median']:.2g}"
-    parts = [
-        f"{key:55} e {1e3 * own['nodal_error']['mean']:.4f} mm",
-        f"relative {100 * own['relative_error']['median']:.3f} (95 % {100 * own['relative_error']['p95']:.2f}) %",
-        f"cos {own['gradient_cosine']['mean']:.5f}",
-        f"Jacobian {100 * own['jacobian_error']['mean']:.1f} %" if "jacobian_error" in own else "no Jacobian",
-        f"residual {residual}",
-        f"of {sound['samples']} inside out {sound['inside_out']}, indefinite {sound['indefinite']}",
-        f"f(0) {1e3 * sound['at_rest']:.3f} mm",
-        *others,
-    ]
-    print("; ".join(parts), flush=True)
-
-
-def main(given: Sequence[str] | None = None) -> None:
-    """Make the rows that are asked for, by the command line or by these words."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    tables = ["4.1", "4.2", "4.5", "physics", "samples", "thesis"]
-    parser.add_argument("--tables", nargs="+", default=["4.2"], choices=tables)
-    parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--train", type=int, default=8192)
-    parser.add_argument("--seconds", type=float, default=200.0)
-    parser.add_argument("--data-seed", type=int, default=0, help="other data, that nothing was chosen on")
-    parser.add_argument("--own-alone", action="store_true", help="leave the other distribution out")
-    parser.add_argument("--data", type=Path, help="data that are there, where FEniCSx is not; `modal` in the record")
-    parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"], help="of the table thesis")
-    parser.add_argument("--channels", type=int, default=128, help="of U-Mesh in the table thesis")
-    parser.add_argument(
-        "--width", type=int, help="of the perceptron in the table thesis; the displacement's if not said"
-    )
-    parser.add_argument("--epochs", type=int, default=EPOCHS, help="of the table thesis")
-    parser.add_argument("--only", default="", help="rows that have this in their name")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args(given)
+def sets_of(given: Given) -> dict[str, DataSet]:
+    """The data that rows are judged on, by their distribution."""
     held_out = {"validation": 256, "test": 512}
-    counts = {"train": arguments.train, **held_out}
-    ranks, seed = arguments.ranks, arguments.data_seed
-    data = {"modal": DataSet(arguments.data) if arguments.data else data_of("modal", counts, ranks, seed)}
-    if not arguments.own_alone and not arguments.data:
-        count = arguments.train if "4.1" in arguments.tables else 16
-        data["random"] = data_of("random", {"train": count, **held_out}, ranks, seed)
-    found = recorded(arguments.name)
-    with reference(data["modal"]) as problem:
-        wanted = list(rows(arguments.tables, arguments.train, arguments.seconds))
-        if "thesis" in arguments.tables:
-            kinds = (Reduced(), Perceptron(arguments.width), UMesh(arguments.channels), Transolver())
-            wanted += thesis_rows(kinds, data["modal"].body, arguments.epochs, arguments.device)
-        for row in wanted:
-            if arguments.only not in row.key:
-                continue
-            key = f"{row.key}, data {seed}" if seed else row.key
-            if not is_made(key, found, draws_of(row, data[row.kind])):
-                learned = data_of("modal", counts, ranks, seed, True) if row.jacobians else None
-                found[key] = run(row, data, problem, learned)
-                write(arguments.name, found)
-            show(key, found[key])
+    if given.data:
+        return {"modal": DataSet(given.data)}
+    found = {"modal": data_of("modal", {"train": given.train, **held_out}, given.ranks, given.data_seed)}
+    if not given.own_alone:
+        count = given.train if "4.1" in given.tables else 16
+        found["random"] = data_of("random", {"train": count, **held_out}, given.ranks, given.data_seed)
+    return found
+
+
+def rows_of(given: Given) -> dict[str, Row]:
+    """All rows that are asked for, by their names in the record."""
+    wanted = list(rows(given.tables, given.train, given.seconds))
+    if "thesis" in given.tables:
+        kinds = (Reduced(), Perceptron(given.width), UMesh(given.channels), Transolver())
+        wanted += thesis_rows(kinds, given.once(sets_of, given)["modal"].body, given.epochs, given.device)
+    return {f"{row.key}, data {given.data_seed}" if given.data_seed else row.key: row for row in wanted}
+
+
+def work(name: str, given: Given) -> dict[str, Any]:
+    row, data, learned = given.once(rows_of, given)[name], given.once(sets_of, given), None
+    if row.jacobians:
+        counts = {"train": given.train, "validation": 256, "test": 512}
+        learned = data_of("modal", counts, given.ranks, given.data_seed, True)
+    return trained(row, data, given.opened(reference, data["modal"]), learned)
+
+
+def with_deviation(name: str, factor: str = "", form: str = ".3f") -> str:
+    """A cell with mean and standard deviation over samples."""
+    return f"{{{name}.mean{factor}:{form}}} +- {{{name}.std{factor}:{form}}}"
+
+
+def lines(found: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A line for each row: held-out errors, how sound the predictions are, other loads, steps and time."""
+    for key, row in found.items():
+        own = row[row["learned_from"]]
+        other = [row[kind] for kind in AMPLITUDES if kind in row and row[kind] is not own]
+        steps = (row["training"] or {}).get("steps", "-")
+        more = {"other": other[0]} if other else {}
+        yield key, {**own, **more, "steps": steps, "wall_s": row["wall_s"]}
+
+
+def least_signal_to_noise(figures: dict[str, Any]) -> str:
+    """The smallest SNR of a split, decibels: that of its largest relative error, since older records hold no least."""
+    return f"{-20.0 * math.log10(figures['relative_error']['max']):.1f}"
+
+
+COLUMNS = (
+    Column("u_2", "m", with_deviation("displacement_norm")),
+    Column("e", "mm", with_deviation("nodal_error", "*1000")),
+    Column("largest", "mm", with_deviation("largest_error", "*1000", ".2f")),
+    Column("norm / nodes", "um", with_deviation("thesis_error", "*1e6", ".2f")),
+    Column("relative (95 %)", "%", "{relative_error.median*100:.3f} ({relative_error.p95*100:.2f})"),
+    Column("SNR", "dB", with_deviation("signal_to_noise", form=".1f")),
+    Column("least SNR", "dB", least_signal_to_noise),
+    Column("cosine", "", "{gradient_cosine.mean:.5f}"),
+    Column("Jacobian", "%", "{jacobian_error.mean*100:.1f}"),
+    Column("residual", "", "{balance.residual.median:.2g}"),
+    Column("inside out; indefinite", "", "{balance.inside_out}; {balance.indefinite} of {balance.samples}"),
+    Column("f(0)", "mm", "{balance.at_rest*1000:.3f}"),
+    Column("other loads: e; largest", "mm", "{other.nodal_error.mean*1000:.3f}; {other.largest_error.mean*1000:.3f}"),
+    Column("steps; s", "", "{steps}; {wall_s:.0f}"),
+)
+BENCHMARK = Benchmark(
+    name="networks",
+    title="Networks against the reference: tables 4.1, 4.2, 4.5, physics in the loss, error against samples",
+    about=("surrogate", "reference"),
+    work=work,
+    rows=lambda given: given.once(rows_of, given),
+    columns=COLUMNS,
+    settings={
+        "tables": Setting(("4.2",), choices=("4.1", "4.2", "4.5", "physics", "samples", "thesis"), picks=True),
+        "train": Setting(8192, "samples to learn from"),
+        "seconds": Setting(200.0, "of training"),
+        "data_seed": Setting(0, "other data, that nothing was chosen on"),
+        "own_alone": Setting(False, "leave the other distribution out"),
+        "data": Setting(None, "data that are there, where FEniCSx is not; `modal` in the record", Path, picks=True),
+        "device": Setting("auto", "of the table thesis", choices=("auto", "cpu", "cuda")),
+        "channels": Setting(128, "of U-Mesh in the table thesis"),
+        "width": Setting(None, "of the perceptron in the table thesis; the displacement's if not said", int),
+        "epochs": Setting(EPOCHS, "of the table thesis"),
+        "ranks": RANKS,
+    },
+    lines=lines,
+    also=("networks_physics", "networks_samples", "networks_thesis"),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -4,24 +4,23 @@
                                          [--samples 1024]
 
 Makes the data under benchmarks/runs/ where they are not there (under mpirun; goes on where it was stopped). Each row is
-one training, judged on 100 held-out samples, and is written as it is finished; the same command goes on.
+one training, judged on 100 held-out samples.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from networks import AMPLITUDES, RUNS, Row, draws_of, is_made, run, show
+from harness import RANKS, Benchmark, Given, Setting, run, started
+from networks import AMPLITUDES, COLUMNS, Row, lines, trained
 from numpy.typing import NDArray
-from record import LIVER, recorded, write
+from record import LIVER, RUNS
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.files import read_mesh
@@ -43,7 +42,6 @@ from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
 
-NAME = "networks_bodies"
 HELD_OUT = {"validation": 100, "test": 100}
 WIDTH = 1500  # of the perceptron's hidden layers in chapter 5
 
@@ -135,10 +133,7 @@ def data_of(name: str, ranks: int, jacobians: bool = False) -> DataSet:
     if made is None or made.missing_blocks() or (jacobians and missing_jacobians(made)):
         if jacobians and made is None:
             shutil.copytree(data_of(name, ranks).path, path)
-        command = [sys.executable, __file__, "--differentiate" if jacobians else "--generate", name]
-        if ranks > 1:
-            command = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), *command]
-        subprocess.run(command, check=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+        started(__file__, "differentiate" if jacobians else "generate", name, ranks=ranks)
     return DataSet(path)
 
 
@@ -183,33 +178,41 @@ def rows(name: str, seconds: float, samples: int | None) -> Iterator[Row]:
     yield Row(chosen.table, f"{name}, reduced, {chosen.modes} modes, whole Jacobians{few}", larger, name, True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bodies", nargs="+", default=["liver", "propeller", "beam"])
-    parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=300.0)
-    parser.add_argument("--samples", type=int, help="learn from the first so many alone")
-    parser.add_argument("--only", default="", help="rows that have this in their name")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    parser.add_argument("--generate", default="", help="make the data of this body alone, and end")
-    parser.add_argument("--differentiate", default="", help="make their Jacobians alone, and end")
-    arguments = parser.parse_args()
-    if arguments.generate or arguments.differentiate:
-        (make if arguments.generate else differentiate_all)(arguments.generate or arguments.differentiate)
-        return
-    found = recorded(arguments.name)
-    for name in arguments.bodies:
-        data = data_of(name, arguments.ranks)
-        with Problem(data.body, data.material, case(name).plan.newton) as problem:
-            for row in rows(name, arguments.seconds, arguments.samples):
-                if arguments.only not in row.key:
-                    continue
-                if not is_made(row.key, found, draws_of(row, data)):
-                    learned = data_of(name, arguments.ranks, True) if row.jacobians else None
-                    found[row.key] = run(row, {name: data}, problem, learned)
-                    write(arguments.name, found)
-                show(row.key, found[row.key])
+def rows_of(given: Given) -> dict[str, Row]:
+    """All rows that are asked for, by their names in the record; their kind is their body."""
+    return {row.key: row for name in given.bodies for row in rows(name, given.seconds, given.samples)}
+
+
+@contextmanager
+def problem_of(name: str, data: DataSet) -> Iterator[Problem]:
+    """The problem that a body's equilibria are of."""
+    with Problem(data.body, data.material, case(name).plan.newton) as problem:
+        yield problem
+
+
+def work(name: str, given: Given) -> dict[str, Any]:
+    row = given.once(rows_of, given)[name]
+    data = given.once(data_of, row.kind, given.ranks)
+    learned = data_of(row.kind, given.ranks, True) if row.jacobians else None
+    return trained(row, {row.kind: data}, given.opened(problem_of, row.kind, data), learned)
+
+
+BENCHMARK = Benchmark(
+    name="networks_bodies",
+    title="Networks on larger bodies: the liver on a sparse grid (4.3, 4.5), beam and propeller (5.1, 5.2)",
+    about=("surrogate", "reference"),
+    work=work,
+    rows=lambda given: given.once(rows_of, given),
+    columns=COLUMNS,
+    settings={
+        "bodies": Setting(("liver", "propeller", "beam"), picks=True),
+        "seconds": Setting(300.0, "of training"),
+        "samples": Setting(None, "learn from the first so many alone", int),
+        "ranks": RANKS,
+    },
+    lines=lines,
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK, parts={"generate": make, "differentiate": differentiate_all})

@@ -10,13 +10,10 @@ takes off: nothing is found there that the true state has not, so a mean other t
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
+from harness import Benchmark, Given, Setting, run
 from liver import SEQUENCES, sequence
-from record import write
 from robustness import forward_model, noisy, registrar_for
-from threadpoolctl import threadpool_limits
 
 from softtwin.registration.loss import Tukey
 
@@ -34,7 +31,7 @@ def measure(name: str, draws: int) -> list[dict[str, float]]:
         registrar = registrar_for(model, data.zone, True)
         observed, net = registrar.observed, registrar.forces.net_basis
         for frame in range(0, 10, 2):
-            state = registrar.register(data.clouds[frame]).trial.state
+            state = registrar.register(data.clouds[frame]).evaluation.state
             truth = (data.positions[frame] - model.body.points)[observed.nodes]
             along = data.net_forces[frame] / np.linalg.norm(data.net_forces[frame])
             for mm, taken in rows:
@@ -54,18 +51,22 @@ def measure(name: str, draws: int) -> list[dict[str, float]]:
     ]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=20)
-    arguments = parser.parse_args()
-    figures = {}
-    with threadpool_limits(1):
-        for name in SEQUENCES:
-            figures[name] = measure(name, arguments.draws)
-            for row in figures[name]:
-                print(name, {key: round(value, 3) for key, value in row.items()}, flush=True)
-    write("noise_bias", {"draws": arguments.draws, "sequences": figures})
+def work(row: str, given: Given) -> list[dict[str, float]]:
+    return measure(row, given.draws)
+
+
+BENCHMARK = Benchmark(
+    name="noise_bias",
+    title="What isotropic noise does to the distances of a cloud from a round surface, and by it to the forces",
+    about=("registration",),
+    work=work,
+    rows=SEQUENCES,
+    settings={"draws": Setting(20, "of each cloud")},
+    small={"draws": 1},
+    under="sequences",
+    finish=lambda figures, given: {"draws": given.draws},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -9,26 +9,27 @@ what the network costs. With --twin, `registered` is the live loop itself on tha
 
 from __future__ import annotations
 
-import argparse
 import json
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
 from pyigtl.messages import CRC64, PointMessage
-from record import write
-from threadpoolctl import threadpool_limits
 
-from softtwin.app.live import Answer, register_live
+from softtwin.app.address import Address
+from softtwin.app.answer import Answer
+from softtwin.app.live import register_live
 from softtwin.app.messages import FIGURES, HEADER_SIZE, Header, Speaker, cloud_message
 from softtwin.app.openigtlink import Link
-from softtwin.app.sources import Address
 from softtwin.app.streams import Mailbox
 from softtwin.app.twin import Sequence, Twin
 from softtwin.meshes.clouds import partial_view
@@ -55,13 +56,13 @@ def exactly(connection: socket.socket, count: int) -> bytes:
     return bytes(found)
 
 
-def play_peer(port: int, file: Path, kind: str, rounds: int) -> None:
+def play_peer(port: str, file: str, kind: str, rounds: str) -> None:
     """The second process: seconds of each round, and bytes of an answer, as JSON."""
     cloud, seconds, size = np.load(file), list[float](), 0
     points = PLACE.lengths(cloud)
     message = PointMessage(points, device_name="camera").pack() if kind == "POINT" else cloud_message(cloud, "camera")
-    with socket.create_connection(("127.0.0.1", port)) as connection:
-        for _ in range(WARM + rounds):
+    with socket.create_connection(("127.0.0.1", int(port))) as connection:
+        for _ in range(WARM + int(rounds)):
             begin, size, device = time.perf_counter(), 0, ""
             connection.sendall(message)
             while device != FIGURES:
@@ -80,8 +81,8 @@ def measured(twin: Twin, cloud: Floats, kind: str, rounds: int, registers: bool,
     frame = sequence.register(cloud)
     assert frame.registration is not None
     with Link(Address("", 0, True), box, PLACE, ours=list(speaker.names.values()), say=lambda line: None) as link:
-        command = [sys.executable, __file__, "--peer", str(link.port), "--cloud", str(file), "--kind", kind]
-        with subprocess.Popen([*command, "--rounds", str(rounds)], stdout=subprocess.PIPE, text=True) as peer:
+        command = [sys.executable, __file__, "peer", str(link.port), str(file), kind, str(rounds)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as peer:
             begin = time.process_time()
             if registers:
 
@@ -116,38 +117,48 @@ def measured(twin: Twin, cloud: Floats, kind: str, rounds: int, registers: bool,
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=300)
-    parser.add_argument("--twin", type=Path, help="folder of softtwin quickstart")
-    parser.add_argument("--peer", type=int, help=argparse.SUPPRESS)
-    parser.add_argument("--cloud", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--kind", default="POINT", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.peer is not None:
-        play_peer(arguments.peer, arguments.cloud, arguments.kind, arguments.rounds)
-        return
-    import tempfile
+def bent() -> tuple[Twin, Floats]:
+    """A cantilever of 2,500 vertices, and a cloud of it under a load."""
+    body = beam((48, 12, 12), (0.30, 0.08, 0.08), "tetrahedron")
+    twin, forces = Twin(Cantilever(body)), np.zeros_like(body.points)
+    forces[body.node_sets["tip"]] = np.array([0.0, 0.06, -0.2]) / len(body.node_sets["tip"])
+    displacement = twin.predict(forces).displacement
+    return twin, partial_view(body, displacement, (1.0, 1.0, 1.0), POINTS, 5e-4, np.random.default_rng(0))
 
-    rows = {}
-    with threadpool_limits(1), tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        body = beam((48, 12, 12), (0.30, 0.08, 0.08), "tetrahedron")
-        with Twin(Cantilever(body)) as twin:
-            forces = np.zeros_like(body.points)
-            forces[body.node_sets["tip"]] = np.array([0.0, 0.06, -0.2]) / len(body.node_sets["tip"])
-            bent = twin.predict(forces).displacement
-            cloud = partial_view(body, bent, (1.0, 1.0, 1.0), POINTS, 5e-4, np.random.default_rng(0))
-            for kind in ("POINT", "POLYDATA"):
-                rows[f"network, {kind}"] = measured(twin, cloud, kind, arguments.rounds, False, folder)
-        if arguments.twin is not None:
-            cloud = np.load(arguments.twin / "demo" / "cloud.npy")
-            with Twin.open(arguments.twin, pose="fixed") as twin:
-                rows["registered"] = measured(twin, cloud, "POINT", arguments.rounds, True, folder)
-    for row, figures in rows.items():
-        print(f"{row}: {figures['surface_vertices']} vertices, {figures['rate_hz']:.1f} Hz, {figures['round_ms']}")
-    write("openigtlink", rows)
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        if row == REGISTERED:
+            cloud = np.load(given.twin / "demo" / "cloud.npy")
+            with Twin.open(given.twin, pose="fixed") as twin:
+                return measured(twin, cloud, "POINT", given.rounds, True, Path(folder))
+        own, cloud = bent()
+        with own as twin:
+            return measured(twin, cloud, row.split(", ")[1], given.rounds, False, Path(folder))
+
+
+REGISTERED = "registered"
+BENCHMARK = Benchmark(
+    name="openigtlink",
+    title="Round trips over OpenIGTLink with a second process: a cloud in; surface, pose and figures out",
+    about=("app",),
+    work=work,
+    rows=lambda given: ["network, POINT", "network, POLYDATA", *([REGISTERED] if given.twin else [])],
+    columns=(
+        Column("points in", "", "{points_in}"),
+        Column("vertices out", "", lambda f: f["surface_vertices"] + f["inner_vertices"]),
+        Column("in; out", "kB", "{bytes_in*0.001:.0f}; {bytes_out*0.001:.0f}"),
+        Column("rate", "Hz", "{rate_hz:.1f}"),
+        Column("round (95 %)", "ms", "{round_ms.p50:.1f} ({round_ms.p95:.1f})"),
+    ),
+    settings={
+        "rounds": Setting(300),
+        "twin": Setting(None, "folder of softtwin quickstart", Path, picks=True),
+    },
+    seeds=(0,),
+    small={"rounds": 5},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK, parts={"peer": play_peer})

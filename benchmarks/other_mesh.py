@@ -10,15 +10,14 @@ zone can do better on that mesh. Errors are mean nodal distances in mm, over the
 
 from __future__ import annotations
 
-import argparse
 from typing import Any
 
 import numpy as np
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
 from numpy.typing import NDArray
-from record import write
 from scipy.sparse import csr_array, kron
-from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.embedding import embed
 from softtwin.reference.data.materials import NeoHookean
@@ -69,7 +68,7 @@ class OtherMesh:
         value, steps = self._objective(state.displacement, wanted, forces), 0
         while steps < _STEPS and limit > _LEAST:
             steps += 1
-            slopes = self.rows @ state.push(basis)
+            slopes = self.rows @ state.jvp(basis)
             missed = (self.carrier.displace(state.displacement) - wanted).ravel()
             values, vectors = np.linalg.eigh(slopes.T @ slopes + np.eye(len(forces)) * (_TOLD / _FREE) ** 2)
             pulled = vectors.T @ (slopes.T @ missed + forces * (_TOLD / _FREE) ** 2)
@@ -110,9 +109,7 @@ def frame_of(mesh: OtherMesh, name: str, frame: int) -> dict[str, Any]:
     """One frame."""
     data = sequence(name, "remeshed")
     wanted = data.positions[frame] - mesh.truth.points
-    true = np.zeros_like(mesh.truth.points)
-    true[data.tool] = data.net_forces[frame] / len(data.tool)
-    state = mesh.model.solve(mesh.carried(true))
+    state = mesh.model.solve(mesh.carried(data.nodal_forces(frame)))
     least, steps = mesh.best(wanted, data.zone)
     return {
         "sequence": name,
@@ -124,26 +121,31 @@ def frame_of(mesh: OtherMesh, name: str, frame: int) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, nargs="+", default=[5, 15, 25])
-    arguments = parser.parse_args()
-    rows = []
-    with threadpool_limits(1), Problem(liver("remeshed"), NeoHookean(YOUNG_MODULUS, POISSON_RATIO)) as problem:
-        mesh = OtherMesh(ReferenceModel(problem, patient=False))
-        for name in SEQUENCES:
-            for frame in arguments.frames:
-                rows.append(frame_of(mesh, name, frame))
-                print(rows[-1], flush=True)
-    each = {
-        name: {
-            kind: float(np.mean([row[kind] for row in rows if row["sequence"] == name]))
-            for kind in ("moved_mm", "carried_mm", "at_best_mm")
-        }
-        for name in SEQUENCES
-    }
-    write("other_mesh", {"sequences": each, "rows": rows})
+def work(row: str, given: Given) -> dict[str, Any]:
+    """Means over the frames of a sequence, and each."""
+    problem = given.opened(Problem, given.once(liver, "remeshed"), given.once(NeoHookean, YOUNG_MODULUS, POISSON_RATIO))
+    mesh = OtherMesh(ReferenceModel(problem, patient=False))
+    rows = [frame_of(mesh, row, frame) for frame in given.frames]
+    kinds = ("moved_mm", "carried_mm", "at_best_mm")
+    return {**{kind: float(np.mean([each[kind] for each in rows])) for kind in kinds}, "rows": rows}
+
+
+BENCHMARK = Benchmark(
+    name="other_mesh",
+    title="How near to the truth another mesh of the real liver can come at all",
+    about=("reference",),
+    work=work,
+    rows=SEQUENCES,
+    columns=(
+        Column("moved", "mm", "{moved_mm:.2f}"),
+        Column("under the true forces", "mm", "{carried_mm:.2f}"),
+        Column("at best", "mm", "{at_best_mm:.2f}"),
+    ),
+    settings={"frames": Setting((5, 15, 25), "of each sequence")},
+    small={"frames": (5,)},
+    under="sequences",
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -15,7 +15,6 @@ and a state tells far more.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,21 +22,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from margins import truths
+from columns import Column
+from harness import FOLDER, Benchmark, Given, Setting, run
+from margins import truths_of
 from numpy.typing import NDArray
-from record import recorded, stamp, write
-from threadpoolctl import threadpool_limits
 
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS
 from softtwin.app.twin import Twin
 from softtwin.meshes.clouds import partial_view
-from softtwin.reference.data.dataset import DataSet
 from softtwin.registration.loss import Loss, Tukey
-from softtwin.registration.problem import Problem, Trial
+from softtwin.registration.problem import Evaluation, Problem
 from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
-NAME = "pcn"
 KEPT = 2000  # states of the chain whose quantities are looked at
 WARM = 0.25  # part of the length before that, in which the step is tuned
 QUANTITIES = ("net force", "mean displacement")
@@ -49,20 +46,20 @@ class Law:
 
     Args:
         problem: what was registered.
-        trial: where the solver ended.
+        evaluation: where the solver ended.
         scale: standard deviation of each coefficient beforehand, (k,).
         noise: found, metres.
         deviations: of the points, (p,), metres.
-        alike: so many points tell what one would.
+        inflation_factor: so many points tell what one would.
         loss: of each.
     """
 
     problem: Problem
-    trial: Trial
+    evaluation: Evaluation
     scale: Floats
     noise: float
     deviations: Floats
-    alike: float
+    inflation_factor: float
     loss: Loss
 
     @classmethod
@@ -71,27 +68,27 @@ class Law:
         problem, scales = found.problem, found.posterior.scales
         scale = np.ones(problem.size)
         scale[problem.force_part] = scales.force
-        deviations = np.hypot(scales.noise, problem.left_out(found.trial))
-        return cls(problem, found.trial, scale, scales.noise, deviations, found.alike, loss or Tukey())
+        deviations = np.hypot(scales.noise, problem.left_out(found.evaluation))
+        return cls(problem, found.evaluation, scale, scales.noise, deviations, found.inflation_factor, loss or Tukey())
 
     def log_likelihood(self, whitened: Floats) -> float:
         """Of coefficients over their scales beforehand, (k,), up to a constant."""
         scaled = self.problem.residuals(self._trial(whitened), self.noise) / self.deviations
-        return -float(self.loss.value(scaled).sum()) / self.alike
+        return -float(self.loss.value(scaled).sum()) / self.inflation_factor
 
-    def _trial(self, whitened: Floats) -> Trial:
-        return self.problem.trial(self.scale * whitened, self.trial)
+    def _trial(self, whitened: Floats) -> Evaluation:
+        return self.problem.evaluation(self.scale * whitened, self.evaluation)
 
     @property
     def mode(self) -> Floats:
         """Where the solver ended, whitened, (k,)."""
-        return self.trial.coefficients / self.scale
+        return self.evaluation.coefficients / self.scale
 
     def covariance(self) -> Floats:
         """Laplace's, whitened, (k, k), with the weights that the product's has."""
-        scaled = self.problem.residuals(self.trial, self.noise) / self.deviations
-        trusted = np.sqrt(self.loss.weight(scaled) / self.alike) / self.deviations
-        slopes = trusted[:, None] * self.problem.jacobian(self.trial) * self.scale
+        scaled = self.problem.residuals(self.evaluation, self.noise) / self.deviations
+        trusted = np.sqrt(self.loss.weight(scaled) / self.inflation_factor) / self.deviations
+        slopes = trusted[:, None] * self.problem.jacobian(self.evaluation) * self.scale
         return np.linalg.inv(slopes.T @ slopes + np.eye(len(self.scale)))
 
     def quantities(self, whitened: Floats) -> Floats:
@@ -105,12 +102,12 @@ class Law:
 
     def slopes(self) -> Floats:
         """Their derivative by the whitened coefficients at the mode, (6, k)."""
-        pushed = self.trial.state.full.push(self.problem.forces.basis)
+        pushed = self.evaluation.state.full.jvp(self.problem.forces.basis)
         blocks = [pushed.reshape(-1, 3, pushed.shape[1]).mean(axis=0)]
         if self.problem.error is not None:
             modes = self.problem.error.size * self.problem.error.discrepancy.modes
             blocks.append(modes.reshape(-1, 3, modes.shape[1]).mean(axis=0))
-        return np.vstack([self.problem.net_forces(self.trial), np.hstack(blocks)]) * self.scale
+        return np.vstack([self.problem.net_forces(self.evaluation), np.hstack(blocks)]) * self.scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,28 +215,50 @@ def frame(twin: Twin, truth: Floats, seed: int) -> Registration:
     return twin.register(partial_view(twin.body, truth, CAMERA, POINTS, NOISE, rng, surface="observed"), "")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--frames", type=int, default=10)
-    parser.add_argument("--length", type=int, default=20_000, help="of each chain, after its step is tuned")
-    parser.add_argument("--about", choices=["laplace", "prior"], default="laplace", help="what proposals are made from")
-    parser.add_argument("--scale", type=float, default=0.2, help="step of the chain to begin with, in (0, 1]")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found, made = recorded(arguments.name), truths(DataSet(arguments.folder / "data.zarr"), arguments.frames)
-    with threadpool_limits(1), Twin.open(arguments.folder, "surrogate", pose="fixed") as twin:
-        for number, (_, truth) in enumerate(made):
-            key = f"frame {number}, about {arguments.about}, {arguments.length} states"
-            if key not in found:
-                result = frame(twin, truth, number)
-                row = compared(Law.of(result), arguments.length, arguments.about, arguments.scale, number)
-                found[key] = {"verdict": result.judgement.verdict.value, **row, "made": stamp()}
-                write(arguments.name, found)
-            told = {name: value for name, value in found[key].items() if name not in ("made", *QUANTITIES)}
-            worst = {name: {kind: found[key][name][kind] for kind in ("apart", "ratio")} for name in QUANTITIES}
-            print(key, told, worst, sep="\n  ", flush=True)
+def work(row: str, given: Given) -> dict[str, Any]:
+    number = int(row.split()[1].rstrip(","))
+    twin = given.opened(opened, given.folder)
+    _, truth = given.once(truths_of, given.folder, given.frames)[number]
+    result = frame(twin, truth, number)
+    found = compared(Law.of(result), given.length, given.about, given.scale, number)
+    return {"verdict": result.judgement.verdict.value, **found}
+
+
+def opened(folder: Path) -> Twin:
+    """The surrogate of a quickstart, its pose known."""
+    return Twin.open(folder, "surrogate", pose="fixed")
+
+
+BENCHMARK = Benchmark(
+    name="pcn",
+    title="Laplace's posterior of a surrogate registration against a chain (preconditioned Crank-Nicolson)",
+    about=("registration", "surrogate"),
+    work=work,
+    rows=lambda given: [f"frame {n}, about {given.about}, {given.length} states" for n in range(given.frames)],
+    columns=(
+        Column("unknowns", "", "{unknowns}"),
+        Column("acceptance", "", "{acceptance:.2f}"),
+        Column("effective states", "", "{effective:.0f}"),
+        *(
+            Column(
+                f"{name}: means apart, in deviations; ratio of deviations",
+                "",
+                f"{{{name}.apart:.2f}}; {{{name}.ratio:.2f}}",
+            )
+            for name in QUANTITIES
+        ),
+        Column("time", "s", "{seconds:.0f}"),
+    ),
+    settings={
+        "folder": FOLDER,
+        "frames": Setting(10, "registered", picks=True),
+        "length": Setting(20_000, "of each chain, after its step is tuned"),
+        "about": Setting("laplace", "what proposals are made from", choices=("laplace", "prior")),
+        "scale": Setting(0.2, "step of the chain to begin with, in (0, 1]"),
+    },
+    small={"frames": 1, "length": 100},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

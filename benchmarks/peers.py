@@ -3,9 +3,9 @@
 All three run plain Newton iterations from rest in equal load steps on one core. What made one faster and is reached
 by its documented interface was taken: symmetric PARDISO, closed forms of stress and tangent, tables made once.
 
-pip install -c ci/constraints.txt -e .[benchmark]
-pip install -c ci/constraints.txt --no-deps torch-fem  # it asks for scipy >= 1.14; what it calls is in Debian's 1.10
-python benchmarks/peers.py
+    pip install -c ci/constraints.txt -e .[benchmark]
+    pip install -c ci/constraints.txt --no-deps torch-fem  # asks for scipy >= 1.14; what it calls is in Debian's 1.10
+    python benchmarks/peers.py
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ import numpy as np
 import scipy.sparse as sp
 import skfem
 import torch
+from columns import Column
+from harness import Benchmark, Given, run
 from liver import POISSON_RATIO, YOUNG_MODULUS, liver, sequence
 from numpy.typing import ArrayLike, NDArray
 from pypardiso import PyPardisoSolver
 from pypardiso.pardiso_wrapper import PyPardisoError
-from record import write
 from skfem.helpers import dot, grad
 from threadpoolctl import threadpool_limits
 from torchfem import Solid
@@ -504,10 +505,8 @@ def _cases() -> Iterator[tuple[str, Body, str, float, float, Floats]]:
     pull = np.zeros_like(bar.points)
     pull[tip, 2] = 1.0 / len(tip)
     yield "beam", bar, "neo-hookean", 5000.0, 0.45, pull
-    organ, data = liver(), sequence("s2")
-    push = np.zeros_like(organ.points)
-    push[data.tool] = data.net_forces[0] / len(data.tool)
-    yield "liver", organ, "neo-hookean", YOUNG_MODULUS, POISSON_RATIO, push
+    push = sequence("s2").nodal_forces(0)
+    yield "liver", liver(), "neo-hookean", YOUNG_MODULUS, POISSON_RATIO, push
     yield "beam", bar, "saint-venant-kirchhoff", 5000.0, 0.3, 0.6 * pull
 
 
@@ -525,36 +524,46 @@ def _ours(
     return state.displacement, float(np.median(seconds)), state.iterations
 
 
-def main() -> None:
-    figures = []
-    for name, body, law, young_modulus, poisson_ratio, forces in _cases():
-        expected, seconds, iterations = _ours(body, law, young_modulus, poisson_ratio, forces)
-        largest = np.abs(expected).max()
-        print(f"{name}, {law}: largest displacement {1e3 * largest:.3f} mm, softtwin {1e3 * seconds:.0f} ms")
-        row: dict[str, Any] = {"problem": f"{name}, {law}", "softtwin_s": seconds, "softtwin_iterations": iterations}
-        for peer, solve in PEERS.items():
-            runs = [solve(body, law, young_modulus, poisson_ratio, forces) for _ in range(3)]
-            found = runs[0]
-            error = np.abs(found.displacement - expected).max()
-            peer_seconds = float(np.median([run.seconds for run in runs]))
-            row[peer] = {
-                "largest_difference_m": error,
-                "agrees": bool(error < 1e-6 * largest),
-                "seconds": peer_seconds,
-                "setup_s": found.setup_seconds,
-                "load_steps": found.load_steps,
-                "iterations": found.iterations,
-                "ratio_ours_to_theirs": seconds / peer_seconds,
-                "note": found.note,
-            }
-            print(
-                f"  {peer:10} {'agrees to' if row[peer]['agrees'] else 'IS OFF BY'} {error:.1e} m; "
-                f"{1e3 * peer_seconds:.0f} ms, ratio {seconds / peer_seconds:.2f}, {found.load_steps} load steps, "
-                f"{found.iterations} iterations, residual {found.residual_norm:.0e} N ({found.note})"
-            )
-        figures.append(row)
-    write("peers", figures)
+def work(row: str, given: Given) -> dict[str, Any]:
+    """One problem by softtwin and by each code: the largest difference, times, load steps."""
+    _, body, law, young_modulus, poisson_ratio, forces = next(
+        case for case in _cases() if f"{case[0]}, {case[2]}" == row
+    )
+    expected, seconds, iterations = _ours(body, law, young_modulus, poisson_ratio, forces)
+    found: dict[str, Any] = {"softtwin_s": seconds, "softtwin_iterations": iterations}
+    for peer, solve in PEERS.items():
+        runs = [solve(body, law, young_modulus, poisson_ratio, forces) for _ in range(3)]
+        error = np.abs(runs[0].displacement - expected).max()
+        peer_seconds = float(np.median([each.seconds for each in runs]))
+        found[peer] = {
+            "largest_difference_m": error,
+            "agrees": bool(error < 1e-6 * np.abs(expected).max()),
+            "seconds": peer_seconds,
+            "setup_s": runs[0].setup_seconds,
+            "load_steps": runs[0].load_steps,
+            "iterations": runs[0].iterations,
+            "residual_N": runs[0].residual_norm,
+            "ratio_ours_to_theirs": seconds / peer_seconds,
+            "note": runs[0].note,
+        }
+    return found
+
+
+BENCHMARK = Benchmark(
+    name="peers",
+    title="The same equilibria by felupe, scikit-fem and torch-fem: differences and times",
+    about=("reference",),
+    work=work,
+    rows=("beam, neo-hookean", "liver, neo-hookean", "beam, saint-venant-kirchhoff"),
+    columns=(
+        Column("softtwin", "ms", "{softtwin_s*1000:.0f}"),
+        *(
+            Column(peer, "ms; difference, m", f"{{{peer}.seconds*1000:.0f}}; {{{peer}.largest_difference_m:.0e}}")
+            for peer in PEERS
+        ),
+    ),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

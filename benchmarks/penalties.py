@@ -11,25 +11,23 @@ in the errors all the same.
 
 from __future__ import annotations
 
-import argparse
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from margins import truths
+from columns import Column, verdicts
+from harness import FOLDER, Benchmark, Given, Setting, run
+from margins import truths_of
 from numpy.typing import NDArray
-from record import recorded, write
-from threadpoolctl import threadpool_limits
+from summaries import counts
 
 from softtwin.app.quickstart import CAMERA, POINTS
 from softtwin.app.twin import Twin
 from softtwin.meshes.clouds import CloudError, partial_view
-from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.outcome import NotConverged
 
 Floats = NDArray[np.float64]
-NAME, NOISE = "penalties", 5e-4
+NOISE = 5e-4
 ROWS: dict[str, dict[str, Any]] = {
     "prior": {},
     "prior, L-BFGS": {"solver": "l-bfgs"},
@@ -60,30 +58,37 @@ def one(twin: Twin, load: Floats, truth: Floats, seed: int) -> dict[str, Any]:
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Over all frames with a result."""
-    used, verdicts = [row for row in rows if row["verdict"] != "none"], [row["verdict"] for row in rows]
-    counts = {name: verdicts.count(name) for name in sorted(set(verdicts))}
-    found: dict[str, Any] = {"loads": len(rows), "verdicts": counts}
+    used = [row for row in rows if row["verdict"] != "none"]
+    found: dict[str, Any] = {"loads": len(rows), "verdicts": counts(row["verdict"] for row in rows)}
     for name in ("error_mm", "forces_off", "net_off", "seconds"):
         values = np.array([row[name] for row in used])
         found[name] = {"mean": values.mean(), "median": np.median(values), "p95": np.quantile(values, 0.95)}
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--loads", type=int, default=8)
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found = recorded(arguments.name)
-    given = truths(DataSet(arguments.folder / "data.zarr"), arguments.loads)
-    for label, options in ROWS.items():
-        if label not in found:
-            with threadpool_limits(1), Twin.open(arguments.folder, "surrogate", pose="fixed", **options) as twin:
-                found[label] = summary([one(twin, *pair, seed) for seed, pair in enumerate(given)])
-            write(arguments.name, found)
-        print(label, found[label], flush=True)
+def work(row: str, given: Given) -> dict[str, Any]:
+    pairs = given.once(truths_of, given.folder, given.loads)
+    with Twin.open(given.folder, "surrogate", pose="fixed", **ROWS[row]) as twin:
+        return summary([one(twin, *pair, seed) for seed, pair in enumerate(pairs)])
+
+
+BENCHMARK = Benchmark(
+    name="penalties",
+    title="What forces cost: the Gaussian prior beside the thesis's penalties (eq. 6.5, 6.6)",
+    about=("registration", "surrogate"),
+    work=work,
+    rows=tuple(ROWS),
+    columns=(
+        Column("accepted; doubtful; refused", "", verdicts),
+        Column("mean nodal (95 %)", "mm", "{error_mm.mean:.2f} ({error_mm.p95:.2f})"),
+        Column("nodal forces off, median", "", "{forces_off.median:.2f}"),
+        Column("net force off, median", "", "{net_off.median:.2f}"),
+        Column("median", "s", "{seconds.median:.2f}"),
+    ),
+    settings={"folder": FOLDER, "loads": Setting(8, "that no data set holds")},
+    small={"loads": 1},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

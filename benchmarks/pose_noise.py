@@ -1,7 +1,6 @@
 """Noise of the pose and of the cloud (figure 6.16 of the thesis): how far organ and net force are off, level by level.
 
-    python benchmarks/pose_noise.py [--twin TWIN] [--engines surrogate reference] [--draws 1000] [--reference-draws 100]
-                                    [--levels 1e-4 1e-3]
+    python benchmarks/pose_noise.py [--twin TWIN] [--draws 1000] [--reference-draws 100] [--only "s 0.001" ...]
 
 One frame of the real liver. As in the thesis the body at rest is turned about the origin of its coordinates by a
 rotation vector and shifted, each component normal with deviation s (rad, metres), every point of the cloud is moved by
@@ -13,25 +12,27 @@ likely the mean square, m^2: 2.5 to 2.7 mm) and 28.0 +- 0.8 to 32.2 +- 7.7 % of 
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from liver import sequence
-from networks import RUNS
 from numpy.typing import NDArray
-from record import recorded, stamp, write
+from record import RUNS
 from robustness import forward_model, registrar_for
 from scipy.spatial.transform import Rotation
-from threadpoolctl import threadpool_limits
+from summaries import counts
 
 from softtwin.reference.data.outcome import NotConverged
+from softtwin.registration.forward import ForwardModel
 from softtwin.registration.pose import Pose
-from softtwin.registration.unknowns import PosePrior
+from softtwin.registration.priors import PosePrior
+from softtwin.registration.registrar import Registrar
+from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
-NAME = "pose_noise"
 SEQUENCE, FRAME = "s3", 25  # the thesis does not say which frame of which of its five
 LEVELS = tuple(np.round(np.linspace(1e-4, 1e-3, 10), 5).tolist())
 POSES = ("pose as it is", "pose unknown")
@@ -75,35 +76,65 @@ def level(registrar: Any, clean: Any, body: Any, s: float, draws: int, has_pose:
         "force_error": spread(np.array(off)),
         "z_rms": float(np.sqrt(np.mean(z2))),
         "median_seconds": float(np.median(seconds)),
-        "verdicts": {name: verdicts.count(name) for name in sorted(set(verdicts))},
+        "verdicts": counts(verdicts),
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--twin", type=Path, default=RUNS / "liver" / "twin")
-    parser.add_argument("--engines", nargs="+", default=["surrogate", "reference"], choices=["surrogate", "reference"])
-    parser.add_argument("--draws", type=int, default=1000)
-    parser.add_argument("--reference-draws", type=int, default=100)
-    parser.add_argument("--levels", nargs="+", type=float, default=LEVELS, help="s, of them the ones to run")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    arguments = parser.parse_args()
-    found, data = recorded(arguments.name), sequence(SEQUENCE)
-    for engine in arguments.engines:
-        draws = arguments.draws if engine == "surrogate" else arguments.reference_draws
-        with threadpool_limits(1), forward_model(engine, arguments.twin) as model:
-            for kind in POSES:
-                has_pose = kind == POSES[1]
-                prior = PosePrior(Pose.identity(), model.body.points.mean(axis=0), _TURN, _SHIFT) if has_pose else None
-                registrar = registrar_for(model, data.zone, True, prior)
-                clean = registrar.register(data.clouds[FRAME])
-                for s in arguments.levels:
-                    key = f"{engine}, {kind}, s {s:g}"
-                    if key not in found:
-                        found[key] = {**level(registrar, clean, model.body, s, draws, has_pose), "made": stamp()}
-                        write(arguments.name, found)
-                    print(key, found[key], flush=True)
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A registrar with the result for the clean cloud."""
+
+    registrar: Registrar
+    clean: Registration
+
+
+def prepared(model: ForwardModel, has_pose: bool) -> Prepared:
+    """With the pose as an unknown, or without."""
+    data = sequence(SEQUENCE)
+    prior = PosePrior(Pose.identity(), model.body.points.mean(axis=0), _TURN, _SHIFT) if has_pose else None
+    registrar = registrar_for(model, data.zone, True, prior)
+    return Prepared(registrar, registrar.register(data.clouds[FRAME]))
+
+
+ROWS = {
+    f"{engine}, {kind}, s {s:g}": (engine, kind == POSES[1], s)
+    for engine in ("surrogate", "reference")
+    for kind in POSES
+    for s in LEVELS
+}
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    engine, has_pose, s = ROWS[row]
+    model = given.opened(forward_model, engine, given.twin)
+    known = given.once(prepared, model, has_pose)
+    draws = given.draws if engine == "surrogate" else given.reference_draws
+    return level(known.registrar, known.clean, model.body, s, draws, has_pose)
+
+
+BENCHMARK = Benchmark(
+    name="pose_noise",
+    title="Noise of pose and cloud (figure 6.16): how far organ and net force are off, level by level",
+    about=("registration", "surrogate", "reference"),
+    work=work,
+    rows=tuple(ROWS),
+    columns=(
+        Column("draws; failed", "", "{draws}; {failed}"),
+        Column("TRE", "mm", "{tre_mm.mean:.2f} +- {tre_mm.deviation:.2f}"),
+        Column("mean square", "1e-6 m^2", "{mean_square_m2.mean*1e6:.2f} +- {mean_square_m2.deviation*1e6:.2f}"),
+        Column("force", "%", "{force_error.mean*100:.1f} +- {force_error.deviation*100:.1f}"),
+        Column("z rms", "", "{z_rms:.2f}"),
+        Column("accepted", "%", lambda f: f"{100 * f['verdicts'].get('accepted', 0) / f['draws']:.0f}"),
+        Column("median", "s", "{median_seconds:.3f}"),
+    ),
+    settings={
+        "twin": Setting(RUNS / "liver" / "twin", "that registration_surrogate.py makes", picks=True),
+        "draws": Setting(1000, "of a level, with the surrogate"),
+        "reference_draws": Setting(100),
+    },
+    small={"draws": 2, "reference_draws": 1},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

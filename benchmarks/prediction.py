@@ -6,13 +6,11 @@ Networks of the beam of 304 hexahedra at the sizes of `networks.py`, with fresh 
 what they have learned. Times are medians. Of a batch the weights are read once, and every sample needs its operations:
 both are given as shares of what a large product or convolution reaches on the same machine. `off` says how far fast
 predictions lie from the surrogate's own, `push_ms` what 64 tangents take by the network's own derivatives and by
-torch.func. Without --data a small data set is made (a minute). Each network is written as it is finished; the same
-command goes on, and --again begins anew.
+torch.func. Without --data a small data set is made (a minute).
 """
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,10 +19,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from networks import CHANNELS, data_of
 from numpy.typing import NDArray
-from record import recorded, write
-from threadpoolctl import threadpool_limits
 
 from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.architecture import Architecture, Differentiated
@@ -46,8 +44,8 @@ def surrogate_of(architecture: Architecture, data: DataSet) -> Surrogate:
     """One with fresh weights."""
     torch.manual_seed(0)
     samples = data.samples("train")
-    lesson = architecture.lesson(data, samples, data.samples("validation"))
-    return Surrogate(data.body, lesson.maps(), lesson.trained(), {"architecture": architecture.name})
+    objective = architecture.objective(data, samples, data.samples("validation"))
+    return Surrogate(data.body, objective.encoder_decoder(), objective.trained(), {"architecture": architecture.name})
 
 
 def median_ms(task: Callable[[], Any]) -> float:
@@ -94,7 +92,7 @@ def counted(surrogate: Surrogate) -> tuple[float, float]:
 
     from softtwin.surrogate.export import Value
 
-    inputs = 3 * len(surrogate.maps.loaded)
+    inputs = 3 * len(surrogate.encoder_decoder.loaded)
     module = Value(surrogate, np.eye(inputs))
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         module(torch.zeros(1, inputs))
@@ -110,10 +108,13 @@ def apart(surrogate: Surrogate, load: NDArray[np.float64], displacement: NDArray
 
 def pushed(surrogate: Surrogate, count: int = 64) -> dict[str, float]:
     """Tangents of the network alone in single precision: by its own derivatives, and by torch.func."""
-    network, width = surrogate.single, len(surrogate.maps.encoded(np.zeros(3 * len(surrogate.maps.loaded))))
+    network, width = (
+        surrogate.single,
+        len(surrogate.encoder_decoder.encoded(np.zeros(3 * len(surrogate.encoder_decoder.loaded)))),
+    )
     at, tangents = torch.ones(width), torch.ones(width, count)
     ways = {"own": network.linearised(at), "torch.func": Differentiated(network, at)}
-    return {name: median_ms(lambda way=way: way.push(tangents)) for name, way in ways.items()}
+    return {name: median_ms(lambda way=way: way.jvp(tangents)) for name, way in ways.items()}
 
 
 def measured(
@@ -155,54 +156,74 @@ def measured(
     return found
 
 
-def show(label: str, found: dict[str, Any]) -> None:
-    """One network, as it is finished."""
-    times = [f"{found['double_ms']:.2f} ms in double", f"{found['single_ms']:.3f} in single precision"]
-    times.append(f"{found['with_jacobian_ms']:.2f} with Jacobian")
-    if "onnxruntime_ms" in found:
-        times.append(f"onnxruntime {found['onnxruntime_ms']:.3f} / {found['onnxruntime_with_jacobian_ms']:.2f}")
-    for batch, f in found["batches"].items():
-        shares = f"{100 * f['share_of_operations']:.0f} % of operations, {100 * f['share_of_bytes']:.0f} % of bytes"
-        times.append(f"{batch} at once {f['samples_per_s']:.0f}/s ({shares})")
-    print(f"{label:20} {'; '.join(times)}", flush=True)
+def kinds(device: str) -> dict[str, Architecture]:
+    """The networks, by their names in the record."""
+    found = {"reduced": Reduced(), "mlp": Perceptron(), f"umesh, {CHANNELS} channels": UMesh(CHANNELS)}
+    found["transolver"] = Transolver()
+    return found | ({"umesh, 128 channels": UMesh(128)} if device == "cuda" else {})
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda"])
-    parser.add_argument("--data", type=Path)
-    parser.add_argument("--again", action="store_true", help="measure what is recorded, too")
-    parser.add_argument("--graphs", action="store_true", help="also export to ONNX and time onnxruntime (CPU)")
-    arguments = parser.parse_args()
-    data = (
-        DataSet(arguments.data)
-        if arguments.data
-        else data_of("modal", {"train": 64, "validation": 256, "test": 512}, 1)
-    )
-    device = arguments.device
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    kinds: dict[str, Architecture] = {
-        "reduced": Reduced(),
-        "mlp": Perceptron(),
-        f"umesh, {CHANNELS} channels": UMesh(CHANNELS),
-        "transolver": Transolver(),
-    }
-    if device == "cuda":
-        kinds["umesh, 128 channels"] = UMesh(128)
-    name = torch.cuda.get_device_name() if device == "cuda" else "one CPU thread"
+def device_of(options: Any) -> str:
+    """`cuda` or `cpu`."""
+    return options.device if options.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def data_for(path: Path | None) -> DataSet:
+    """The data set that is given, or a small one that is made."""
+    return DataSet(path) if path else data_of("modal", {"train": 64, "validation": 256, "test": 512}, 1)
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
     torch.set_num_threads(1)
-    record = "prediction" if device == "cpu" else f"prediction_{name.replace(' ', '_').lower()}"
-    figures: dict[str, Any] = ({} if arguments.again else recorded(record)) or {"device": name, "networks": {}}
-    with threadpool_limits(1):
-        limits = figures["peak"] = figures.get("peak") or peak(device)
-        for label, architecture in kinds.items():
-            if label not in figures["networks"]:
-                graphs = arguments.graphs and label != "transolver"  # half a minute, for a baseline
-                figures["networks"][label] = measured(architecture, data, device, graphs, limits)
-                write(record, figures)
-            show(label, figures["networks"][label])
+    device, limits = device_of(given), given.once(peak, device_of(given))
+    graphs = given.graphs and row != "transolver"  # half a minute, for a baseline
+    return measured(kinds(device)[row], given.once(data_for, given.data), device, graphs, limits)
+
+
+def machine(figures: dict[str, Any], given: Given) -> dict[str, Any]:
+    """What was measured on, and what it reaches."""
+    device = device_of(given)
+    name = torch.cuda.get_device_name() if device == "cuda" else "one CPU thread"
+    return {"device": name, "peak": given.once(peak, device)}
+
+
+def at_once(batch: int) -> str:
+    """The cell of a batch."""
+    path = f"batches.{batch}"
+    return f"{{{path}.samples_per_s:,.0f}}; {{{path}.share_of_operations*100:.0f}}; {{{path}.share_of_bytes*100:.1f}}"
+
+
+BENCHMARK = Benchmark(
+    name="prediction",
+    title="What a prediction costs, host to host: one sample, Jacobians, batches, and shares of the machine",
+    about=("surrogate",),
+    work=work,
+    rows=lambda given: kinds(device_of(given)),
+    columns=(
+        Column("double", "ms", "{double_ms:.2f}"),
+        Column("single", "ms", "{single_ms:.2f}"),
+        Column("with Jacobian", "ms", "{with_jacobian_ms:.1f}"),
+        Column("onnxruntime: value; with Jacobian", "ms", "{onnxruntime_ms:.2f}; {onnxruntime_with_jacobian_ms:.2f}"),
+        Column("weights", "MB", "{weights_bytes*1e-6:.1f}"),
+        Column("operations a sample", "millions", "{operations*1e-6:.0f}"),
+        *(Column(f"{n} at once: a second; % of operations; % of bytes (weights)", "", at_once(n)) for n in BATCHES),
+    ),
+    settings={
+        "device": Setting("auto", choices=("auto", "cpu", "cuda")),
+        "data": Setting(None, "a data set of the beam", Path, picks=True),
+        "graphs": Setting(False, "also export to ONNX and time onnxruntime (CPU)"),
+    },
+    under="networks",
+    finish=machine,
+    also=("prediction_*",),
+    named=lambda options: f"prediction_{slug()}" if device_of(options) == "cuda" else "prediction",
+)
+
+
+def slug() -> str:
+    """The GPU's name as part of a file's."""
+    return torch.cuda.get_device_name().replace(" ", "_").lower()
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

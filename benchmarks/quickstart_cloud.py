@@ -9,14 +9,12 @@ the result of the cloud before it.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from columns import Column
+from harness import FOLDER, Benchmark, Given, Setting, run
 from numpy.typing import NDArray
-from record import write
-from threadpoolctl import threadpool_limits
 
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS  # what its own cloud is made with
 from softtwin.app.twin import Twin
@@ -48,51 +46,68 @@ def row(kind: str, result: Registration, body: Body, truth: Floats) -> dict[str,
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--draws", type=int, default=20)
-    arguments = parser.parse_args()
-    truth = np.load(arguments.folder / "demo" / "truth.npy")
-    own = np.load(arguments.folder / "demo" / "cloud.npy")
-    rows: list[dict[str, Any]] = []
-    with threadpool_limits(1), Twin.open(arguments.folder, pose="fixed") as twin:
-        body = twin.body
+def work(row_name: str, given: Given) -> dict[str, Any]:
+    truth, own = (np.load(given.folder / "demo" / f"{name}.npy") for name in ("truth", "cloud"))
+    with Twin.open(given.folder, pose="fixed") as twin:
 
         def seen(count: int, seed: int) -> Floats:
             rng = np.random.default_rng(seed)
-            return partial_view(body, truth, CAMERA, count, NOISE, rng, surface="observed")
+            return partial_view(twin.body, truth, CAMERA, count, NOISE, rng, surface="observed")
 
-        clouds = [own, *(seen(POINTS, 100 + draw) for draw in range(arguments.draws))]
+        clouds = [own, *(seen(POINTS, 100 + draw) for draw in range(given.draws))]
         twin.registrar("")  # prepared once
-        last: Registration | None = None
-        for cloud in clouds:
-            cold = twin.register(cloud, "")
-            rows.append(row("cold", cold, body, truth))
-            warm = twin.register(cloud, "", last or cold)
-            rows.append(row("warm", warm, body, truth))
-            last = warm
+        rows = frames(twin, clouds, truth)
         sizes = {}
-        for count in SIZES:
-            cloud = seen(count, 7)
-            cold = twin.register(cloud, "")
-            sizes[count] = {**row("cold", cold, body, truth), "points_used": cold.points}
-    figures = {"own cloud": rows[0], "rows": rows, "sizes": sizes, "summary": {}}
-    for kind in ("cold", "warm"):
-        some = [entry for entry in rows if entry["start"] == kind]
-        figures["summary"][kind] = {
-            "median_seconds": float(np.median([entry["seconds"] for entry in some])),
-            "longest_seconds": max(entry["seconds"] for entry in some),
-            "tumour_mm": float(np.mean([entry["tumour"] for entry in some])),
-            "tumour_worst_mm": max(entry["tumour"] for entry in some),
-            "nodes_mm": float(np.mean([entry["nodes"] for entry in some])),
-            "accepted": float(np.mean([entry["verdict"] == "accepted" for entry in some])),
-        }
-        print(kind, figures["summary"][kind])
-    for count, entry in sizes.items():
-        print(f"{count:8d} points: {entry['seconds']:.2f} s, tumour {entry['tumour']:.2f} mm, {entry['verdict']}")
-    write("quickstart_cloud", figures)
+        for count in SIZES[: given.sizes]:
+            cold = twin.register(seen(count, 7), "")
+            sizes[count] = {**row("cold", cold, twin.body, truth), "points_used": cold.points}
+    starts = {kind: summary([entry for entry in rows if entry["start"] == kind]) for kind in ("cold", "warm")}
+    return {"own cloud": rows[0], "rows": rows, "sizes": sizes, "summary": starts}
+
+
+def frames(twin: Twin, clouds: list[Floats], truth: Floats) -> list[dict[str, Any]]:
+    """Each cloud from rest, and from the result of the cloud before it."""
+    rows, last = [], None
+    for cloud in clouds:
+        cold = twin.register(cloud, "")
+        last = twin.register(cloud, "", last or cold)
+        rows += [row(kind, found, twin.body, truth) for kind, found in (("cold", cold), ("warm", last))]
+    return rows
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Over all clouds of one start."""
+    return {
+        "median_seconds": float(np.median([entry["seconds"] for entry in rows])),
+        "longest_seconds": max(entry["seconds"] for entry in rows),
+        "tumour_mm": float(np.mean([entry["tumour"] for entry in rows])),
+        "tumour_worst_mm": max(entry["tumour"] for entry in rows),
+        "nodes_mm": float(np.mean([entry["nodes"] for entry in rows])),
+        "accepted": float(np.mean([entry["verdict"] == "accepted" for entry in rows])),
+    }
+
+
+BENCHMARK = Benchmark(
+    name="quickstart_cloud",
+    title="The quickstart's twin without a zone: cold and warm frames, the tumour's error, up to a million points",
+    about=("registration", "surrogate"),
+    work=work,
+    columns=(
+        Column("tumour (worst)", "mm", "{tumour_mm:.2f} ({tumour_worst_mm:.2f})"),
+        Column("nodes", "mm", "{nodes_mm:.2f}"),
+        Column("accepted", "%", "{accepted*100:.0f}"),
+        Column("median (longest)", "s", "{median_seconds:.2f} ({longest_seconds:.2f})"),
+    ),
+    settings={
+        "folder": FOLDER,
+        "draws": Setting(20, "clouds beside the quickstart's own"),
+        "sizes": Setting(len(SIZES), "of clouds, of those tried"),
+    },
+    seeds=(7, 100),
+    small={"draws": 2, "sizes": 1},
+    lines=lambda figures: figures["summary"].items(),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -5,20 +5,17 @@ python benchmarks/reference_solves.py
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from beam_hard import draw
+from harness import Benchmark, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
 from numpy.typing import NDArray
-from record import write
 from scipy.optimize import brentq
-from threadpoolctl import threadpool_limits
+from summaries import median_seconds, resident_mib
 
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import NeoHookean, SaintVenantKirchhoff
@@ -27,16 +24,6 @@ from softtwin.reference.solve.problem import NewtonOptions, Problem
 
 Floats = NDArray[np.float64]
 FRAMES = (0, 10, 25, 40)
-
-
-def median_s(call: Callable[[], Any], repeats: int) -> float:
-    """Median wall time of a call, seconds."""
-    seconds = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - begin)
-    return float(np.median(seconds))
 
 
 def large_beam() -> dict[str, Any]:
@@ -58,10 +45,11 @@ def large_beam() -> dict[str, Any]:
         return {
             "unknowns": problem.size,
             "tip_m": float(state.displacement[tip, 2].mean()),
-            "solve_s": median_s(lambda: problem.solve(forces, stability=False), 9),
+            "solve_s": median_seconds(lambda: problem.solve(forces, stability=False), 9),
             "iterations": state.iterations,
             "factorisations": state.factorisations,
-            "newton_iteration_s": median_s(lambda: newton.solve(forces, rest, stability=False), 5) / each.iterations,
+            "newton_iteration_s": median_seconds(lambda: newton.solve(forces, rest, stability=False), 5)
+            / each.iterations,
             "newton_iterations_from_rest": each.iterations,
         }
 
@@ -74,18 +62,17 @@ def real_liver() -> dict[str, Any]:
         for name in SEQUENCES:
             data = sequence(name)
             for frame in FRAMES:
-                forces = np.zeros_like(body.points)
-                forces[data.tool] = data.net_forces[frame] / len(data.tool)
+                forces = data.nodal_forces(frame)
                 state = problem.solve(forces)
                 figures[f"{name} {frame}"] = {
-                    "seconds": median_s(partial(problem.solve, forces, stability=False), 5),
+                    "seconds": median_seconds(partial(problem.solve, forces, stability=False), 5),
                     "iterations": state.iterations,
                     "factorisations": state.factorisations,
                     "local_iterations": state.local_iterations,
                     "load_steps": state.load_steps,
                     "negative_pivots": state.negative_pivots,
                     "largest_error_m": float(np.abs(body.points + state.displacement - data.positions[frame]).max()),
-                    "seconds_without_elimination": median_s(partial(without.solve, forces, stability=False), 3),
+                    "seconds_without_elimination": median_seconds(partial(without.solve, forces, stability=False), 3),
                     "factorisations_without_elimination": without.solve(forces, stability=False).factorisations,
                 }
     figures["median_seconds"] = float(np.median([row["seconds"] for row in figures.values()]))
@@ -94,10 +81,8 @@ def real_liver() -> dict[str, Any]:
 
 def gradients() -> dict[str, Any]:
     """A gradient by all nodal forces against the solve that came before it: on the beam and on the liver."""
-    bar, organ, data = beam(), liver(), sequence("s2")
-    load = np.zeros_like(organ.points)
-    load[data.tool] = data.net_forces[0] / len(data.tool)
-    cases = {"beam": (bar, draw(bar, np.random.default_rng(0))), "liver": (organ, load)}
+    bar = beam()
+    cases = {"beam": (bar, draw(bar, np.random.default_rng(0))), "liver": (liver(), sequence("s2").nodal_forces(0))}
     figures = {}
     for name, (body, forces) in cases.items():
         cotangent = np.random.default_rng(0).standard_normal(body.points.shape)
@@ -117,7 +102,7 @@ def gradients() -> dict[str, Any]:
                 figures[f"{name}, {key}"] = {"solve_s": solve, "gradient_s": gradient, "ratio": gradient / solve}
             Linearisation(problem, forces, state).gradient(cotangent)  # compiles
             whole = partial(Linearisation(problem, forces, state).gradient, cotangent)
-            figures[f"{name}, by forces and parameters"] = {"gradient_s": median_s(whole, 5)}
+            figures[f"{name}, by forces and parameters"] = {"gradient_s": median_seconds(whole, 5)}
     return figures
 
 
@@ -130,7 +115,7 @@ def memory(count: int = 1000) -> dict[str, Any]:
         for i in range(1, count + 1):
             problem.solve(draw(body, rng))
             if i in (50, count):
-                seen[i] = resident_MiB()
+                seen[i] = resident_mib()
     return {
         "solves": count,
         "after_50_MiB": seen[50],
@@ -139,20 +124,16 @@ def memory(count: int = 1000) -> dict[str, Any]:
     }
 
 
-def resident_MiB() -> float:  # noqa: N802 - the unit's own letters
-    """Resident memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-
-def main() -> None:
-    figures = {}
-    with threadpool_limits(1):
-        for study in (large_beam, real_liver, gradients, memory):
-            figures[study.__name__] = study()
-            print(study.__name__, figures[study.__name__], flush=True)
-    write("reference_solves", figures)
+STUDIES = {study.__name__: study for study in (large_beam, real_liver, gradients, memory)}
+BENCHMARK = Benchmark(
+    name="reference_solves",
+    title="What solves of the reference cost: a beam of 12,000 unknowns, the real liver, gradients, memory",
+    about=("reference",),
+    work=lambda row, given: STUDIES[row](),
+    rows=tuple(STUDIES),
+    seeds=(0, 1),
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -1,6 +1,6 @@
 """Registration of the real liver with the reference: s1, s2, s3, frames 0-49, against the computed truth.
 
-python benchmarks/registration_reference.py [--mesh default|remeshed] [--attachment facets|listed]
+    python benchmarks/registration_reference.py [--mesh default|remeshed] [--attachment facets|listed]
 
 On mesh-remeshed the truth's nodes (of mesh-default) are carried by the other mesh's cells, the nearest one where a node
 lies outside it.
@@ -8,11 +8,13 @@ lies outside it.
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequence
-from record import write
 
 from softtwin.meshes.embedding import embed
 from softtwin.reference.data.materials import NeoHookean
@@ -23,7 +25,7 @@ from softtwin.registration.options import RegistrationOptions, expected_force, o
 from softtwin.registration.registrar import prepare, register_sequence
 
 
-def run(
+def registered(
     data: Sequence, model: ForwardModel, frames: int, options: RegistrationOptions, smoothness: float
 ) -> list[dict[str, float]]:
     """Errors at the truth's nodes, forces and times of every frame of a sequence, with any forward model."""
@@ -83,32 +85,54 @@ def summary(rows: list[dict[str, float]]) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=50)
-    parser.add_argument("--smoothness", type=float, default=0.02)
-    parser.add_argument("--mesh", choices=["default", "remeshed"], default="default")
-    parser.add_argument("--attachment", choices=["facets", "listed"], default="facets")
-    parser.add_argument("--sequences", nargs="+", default=list(SEQUENCES))
-    arguments = parser.parse_args()
-    body = liver(arguments.mesh, arguments.attachment)
-    figures = {
-        "smoothness": arguments.smoothness,
-        "mesh": arguments.mesh,
-        "attachment": arguments.attachment,
-        "sequences": {},
-    }
-    newton = NewtonOptions(tolerance=1e-5, max_iterations=15)
-    with Problem(body, NeoHookean(YOUNG_MODULUS, POISSON_RATIO), newton) as problem:
-        for name in arguments.sequences:
-            data = sequence(name, arguments.mesh)
-            model = ReferenceModel(problem, patient=False)
-            options = options_for(model, has_zone=True)
-            rows = run(data, model, arguments.frames, options, arguments.smoothness)
-            figures["sequences"][name] = {"summary": summary(rows), "frames": rows}
-            print(name, {key: round(value, 4) for key, value in summary(rows).items()}, flush=True)
-    write(f"registration_reference_{arguments.mesh}_{arguments.attachment}", figures)
+LOOSE, MATERIAL = NewtonOptions(tolerance=1e-5, max_iterations=15), NeoHookean(YOUNG_MODULUS, POISSON_RATIO)
+COLUMNS = (
+    Column("mean TRE", "mm", "{mean_tre_mm:.3f}"),
+    Column("worst frame's", "mm", "{worst_tre_mm:.2f}"),
+    Column("net force off", "%", "{mean_force_error*100:.1f}"),
+    Column("median; 95 %; longest", "s", "{median_seconds:.3f}; {p95_seconds:.3f}; {longest_seconds:.2f}"),
+    Column("cold frame 0: TRE", "mm", "{cold_tre_mm:.3f}"),
+    Column("- force", "%", "{cold_force_error*100:.1f}"),
+    Column("- time", "s", "{cold_seconds:.2f}"),
+)
+
+
+def with_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """A sequence's frames and what they come to."""
+    return {"summary": summary(rows), "frames": rows}
+
+
+def lines(rows: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A line for each sequence."""
+    return ((name, found["summary"]) for name, found in rows.items())
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    problem = given.opened(Problem, given.once(liver, given.mesh, given.attachment), MATERIAL, LOOSE)
+    model = ReferenceModel(problem, patient=False)
+    options = options_for(model, has_zone=True)
+    return with_summary(registered(sequence(row, given.mesh), model, given.frames, options, given.smoothness))
+
+
+BENCHMARK = Benchmark(
+    name="registration_reference_{mesh}_{attachment}",
+    title="Registration of the real liver's sequences with the reference, against the computed truth",
+    about=("registration", "reference"),
+    work=work,
+    rows=SEQUENCES,
+    columns=COLUMNS,
+    settings={
+        "frames": Setting(50, "of each sequence"),
+        "smoothness": Setting(0.02, "correlation length of the forces, metres"),
+        "mesh": Setting("default", choices=("default", "remeshed")),
+        "attachment": Setting("facets", choices=("facets", "listed")),
+    },
+    small={"frames": 2},
+    under="sequences",
+    lines=lines,
+    finish=lambda figures, given: {name: getattr(given, name) for name in ("smoothness", "mesh", "attachment")},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

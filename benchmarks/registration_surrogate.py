@@ -1,19 +1,20 @@
 """Registration of the real liver with a surrogate: the same frames, truth and metrics as with the reference.
 
     python benchmarks/registration_surrogate.py [--ranks 2] [--seconds 300] [--draws 1360] [--frames 50]
+    python benchmarks/registration_surrogate.py twin 320      # the twin alone, for liver_engines.py and others
 
 Makes the data set under benchmarks/runs/liver where it is not there, and trains the twin.
 """
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
+from typing import Any
 
+from harness import RANKS, Benchmark, Given, Setting, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
-from record import write
-from registration_reference import run, summary
-from threadpoolctl import threadpool_limits
+from record import RUNS
+from registration_reference import COLUMNS, lines, registered, with_summary
 
 from softtwin.app.chain import prepare
 from softtwin.app.config import Config
@@ -22,8 +23,8 @@ from softtwin.app.stages.learn import train_stage, validate_stage
 from softtwin.app.workspace import Workspace
 from softtwin.meshes.files import write_body
 from softtwin.registration.options import options_for
-
-RUNS = Path(__file__).parent / "runs"
+from softtwin.surrogate.model import Surrogate
+from softtwin.surrogate.twin import load
 
 
 def liver_config(seconds: float, ranks: int, draws: int = 1360) -> Config:
@@ -49,7 +50,7 @@ def liver_config(seconds: float, ranks: int, draws: int = 1360) -> Config:
     )
 
 
-def make_twin(seconds: float, ranks: int, folder: Path, draws: int) -> Workspace:
+def made_twin(seconds: float, ranks: int, folder: Path, draws: int) -> Workspace:
     """The liver's twin; a data set that is there is not made again."""
     config = liver_config(seconds, ranks, draws)
     if (folder / "organ.toml").exists():  # its mesh came from no stage: `prepare` would not know it again
@@ -63,30 +64,48 @@ def make_twin(seconds: float, ranks: int, folder: Path, draws: int) -> Workspace
     return space
 
 
-def main() -> None:
-    from softtwin.surrogate.twin import load
+def twin_alone(draws: str, seconds: str = "270") -> None:
+    """Make the twin where others look for it, and register nothing."""
+    made_twin(float(seconds), RANKS.default, RUNS / "liver", int(draws))
 
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--ranks", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=270.0)
-    parser.add_argument("--draws", type=int, default=1360, help="that the network learns from")
-    parser.add_argument("--frames", type=int, default=50)
-    parser.add_argument("--smoothness", type=float, default=0.02)
-    parser.add_argument("--folder", type=Path, default=RUNS / "liver")
-    parser.add_argument("--twin", type=Path, help="register with this finished twin instead of making one")
-    arguments = parser.parse_args()
-    twin = arguments.twin or make_twin(arguments.seconds, arguments.ranks, arguments.folder, arguments.draws).twin
-    body = liver()
-    model = load(twin, body)
-    figures = {"smoothness": arguments.smoothness, "sequences": {}}
-    figures["held_out"] = model.card.get("held_out")
-    with threadpool_limits(1):
-        for name in SEQUENCES:
-            rows = run(sequence(name), model, arguments.frames, options_for(model, has_zone=True), arguments.smoothness)
-            figures["sequences"][name] = {"summary": summary(rows), "frames": rows}
-            print(name, {key: round(value, 4) for key, value in summary(rows).items()}, flush=True)
-    write("registration_surrogate", figures)
+
+def learned(given: Given) -> Surrogate:
+    """The twin that is given, or one that is made."""
+    folder = given.twin or made_twin(given.seconds, given.ranks, given.folder, given.draws).twin
+    return load(folder, liver())
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    model = given.once(learned, given)
+    options = options_for(model, has_zone=True)
+    return with_summary(registered(sequence(row), model, given.frames, options, given.smoothness))
+
+
+BENCHMARK = Benchmark(
+    name="registration_surrogate",
+    title="Registration of the real liver's sequences with a surrogate, against the computed truth",
+    about=("registration", "surrogate", "reference"),
+    work=work,
+    rows=SEQUENCES,
+    columns=COLUMNS,
+    settings={
+        "draws": Setting(1360, "that the network learns from"),
+        "seconds": Setting(270.0, "of training"),
+        "frames": Setting(50, "of each sequence"),
+        "smoothness": Setting(0.02, "correlation length of the forces, metres"),
+        "folder": Setting(RUNS / "liver", "where the twin is made", picks=True),
+        "twin": Setting(None, "a finished twin instead of making one", kind=Path, picks=True),
+        "ranks": RANKS,
+    },
+    small={"frames": 2},
+    under="sequences",
+    lines=lines,
+    finish=lambda figures, given: {
+        "smoothness": given.smoothness,
+        "held_out": given.once(learned, given).card.get("held_out"),
+    },
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK, parts={"twin": twin_alone})

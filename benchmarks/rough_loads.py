@@ -7,17 +7,14 @@ elimination, are the yardstick. Time is one cold solve each, with its stability.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import time
 from itertools import cycle, islice
 from typing import Any
 from unittest import mock
 
 import numpy as np
+from harness import Benchmark, Given, Setting, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, liver, sequence
-from record import write
 
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.outcome import Equilibrium, NotConverged
@@ -80,9 +77,20 @@ def study(count: int) -> dict[str, Any]:
     return figures
 
 
-def main() -> None:
-    write("rough_loads", study(12))
+def work(row: str, given: Given) -> dict[str, Any]:
+    return study(given.loads)
+
+
+BENCHMARK = Benchmark(
+    name="rough_loads",
+    title="Which branch a cold solve ends on: loads that differ from node to node on the real liver",
+    about=("reference",),
+    work=work,
+    settings={"loads": Setting(12, "one sequence after the other")},
+    seeds=(1,),
+    small={"loads": 1},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -1,12 +1,12 @@
 """Surfaces made of segmentations: how far from the true ones, for voxels fine, coarse and flat.
 
-    python benchmarks/segmentations.py
+    python benchmarks/segmentations.py [--largest]
 
 The liver phantom and its portal vein (branches 5 to 9 mm across), and livers as strangers bring them where
 ../shared/data/surfaces has them, are filled with voxels whose middles they enclose, written as NIfTI in a grid that is
 turned by 20 degrees, and read back as `softtwin build` reads a segmentation. Distances are from points all over the
-surface made to the true one. The phantom's outline here is that of its mesh. `512 x 512 x 512`
-is the phantom in so many voxels, read by a process of its own: its time, and by how much its memory grew at most.
+surface made to the true one. The phantom's outline here is that of its mesh. `--largest`
+reads the phantom in 512 x 512 x 512 voxels by a process of its own: its time, and by how much its memory grew at most.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from typing import Any
 import nibabel
 import numpy as np
 import pyvista
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
-from record import write
-from surfaces import FILES, SURFACES
+from surfaces import SURFACES, surface_of
 from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
 
-from softtwin.meshes.body import Body, Surface
-from softtwin.meshes.files import read_mesh
+from softtwin.meshes.body import Surface
 from softtwin.meshes.segmentation import inner_surface, organ_surface, read_segmentation
 from softtwin.meshes.shapes import liver_phantom
 
@@ -39,17 +39,12 @@ STRANGERS = ("sofa-liver.vtk", "sks-liver-sub.ply")
 _SAMPLES = 20_000
 
 
-def true_surfaces() -> dict[str, tuple[Surface, bool]]:
-    """Each surface by name, metres, and whether it is an organ (its largest component counts) or lies inside one."""
+def true_surface(name: str) -> tuple[Surface, bool]:
+    """A surface by name, metres, and whether it is an organ (its largest component counts) or lies inside one."""
+    if name in STRANGERS:
+        return surface_of(name), True
     body = liver_phantom(0.004)
-    found = {"phantom": (body.boundary_surface, True), "phantom, portal vein": (body.inner["vessel_portal"], False)}
-    for name in STRANGERS:
-        if not (SURFACES / name).is_file():
-            print(f"skipped: no {name} in {SURFACES}")
-        else:
-            mesh = read_mesh(SURFACES / name, FILES[name])
-            found[name] = (mesh if isinstance(mesh, Surface) else Body(*mesh, {}).boundary_surface, True)
-    return found
+    return (body.boundary_surface, True) if name == "phantom" else (body.inner["vessel_portal"], False)
 
 
 def poly(points: Floats, surface: Surface) -> pyvista.PolyData:
@@ -129,20 +124,46 @@ print(json.dumps({"seconds": time.perf_counter() - begin, "memory_gb": most() - 
 """
 
 
-def main() -> None:
-    rows: dict[str, Any] = {}
-    truths = true_surfaces()
+ROWS = {
+    f"{name}, {' x '.join(f'{size:g}' for size in spacing)}": (name, spacing)
+    for name in ("phantom", "phantom, portal vein", *STRANGERS)
+    for spacing in SPACINGS
+}
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    name, spacing = ROWS[row]
     with tempfile.TemporaryDirectory() as folder:
-        for name, (truth, is_organ) in truths.items():
-            for spacing in SPACINGS:
-                label = f"{name}, {' x '.join(f'{size:g}' for size in spacing)}"
-                row = rows[label] = measured(truth, is_organ, spacing, Path(folder) / "labels.nii.gz")
-                print(f"{label}: volume {100 * row['volume_off']:+.2f} %, mean {row['mean_mm']:.2f} mm, "
-                      f"largest {row['largest_mm']:.2f} mm", flush=True)  # fmt: skip
-        big = largest(truths["phantom"][0], Path(folder) / "largest.nii.gz")
-        print(f"{LARGEST} voxels a side: {big}")
-    write("segmentations", {"surfaces": rows, "largest": big})
+        return measured(*given.once(true_surface, name), spacing, Path(folder) / "labels.nii.gz")
+
+
+def with_largest(figures: dict[str, Any], given: Given) -> dict[str, Any]:
+    """Seconds and memory of the largest volume, once a record and only where it is asked for."""
+    if not given.largest:
+        return {}
+    with tempfile.TemporaryDirectory() as folder:
+        return {"largest": given.once(largest, given.once(true_surface, "phantom")[0], Path(folder) / "largest.nii.gz")}
+
+
+BENCHMARK = Benchmark(
+    name="segmentations",
+    title="Surfaces made of segmentations: volume, and distances to the true surface",
+    about=("meshes",),
+    work=work,
+    rows=lambda given: [row for row, (name, _) in ROWS.items() if name not in STRANGERS or (SURFACES / name).is_file()],
+    columns=(
+        Column("volume", "", "{volume_off*100:+.2f} %"),
+        Column("mean", "mm", "{mean_mm:.2f}"),
+        Column("95 %", "mm", "{p95_mm:.2f}"),
+        Column("largest", "mm", "{largest_mm:.2f}"),
+        Column("time", "s", "{seconds:.1f}"),
+    ),
+    settings={"largest": Setting(False, f"read {LARGEST} x {LARGEST} x {LARGEST} voxels, too", picks=True)},
+    seeds=(0,),
+    under="surfaces",
+    finish=with_largest,
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -9,16 +9,16 @@ The organ moves slowly between states under loads of its kind (solved by the ref
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from margins import truths
+from harness import FOLDER, Benchmark, Given, Setting, run
+from margins import truths_of
 from numpy.typing import NDArray
-from record import write
-from threadpoolctl import threadpool_limits
+from summaries import resident_mib
 
 from softtwin.app.live import answers
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS
@@ -26,34 +26,22 @@ from softtwin.app.streams import fed
 from softtwin.app.twin import Sequence, Twin
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.metrics import nodal_distances
-from softtwin.reference.data.dataset import DataSet
 
 Floats = NDArray[np.float64]
 STATES, BETWEEN = 8, 60  # frames from one state to the next
 
 
-def resident_mib() -> float:
-    """Memory that this process holds."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * 4096 / 2**20
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--rate", type=float, default=60.0, help="clouds a second")
-    parser.add_argument("--budget", type=float, default=0.1, help="seconds")
-    parser.add_argument("--engine", default="surrogate")
-    arguments = parser.parse_args()
-    data = DataSet(arguments.folder / "data.zarr")
-    states = [state for _, state in truths(data, STATES)]
+def path_of(folder: Path) -> list[Floats]:
+    """Displacements of the organ as it moves from state to state and back to the first."""
+    states = [state for _, state in truths_of(folder, STATES)]
     shares = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, BETWEEN, endpoint=False))
-    path = [
-        (1.0 - share) * a + share * b for a, b in zip(states, states[1:] + states[:1], strict=True) for share in shares
-    ]
-    rng = np.random.default_rng(0)
-    with threadpool_limits(1), Twin.open(arguments.folder, arguments.engine, pose="fixed") as twin:
+    pairs = zip(states, states[1:] + states[:1], strict=True)
+    return [(1.0 - share) * a + share * b for a, b in pairs for share in shares]
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    path, rng = path_of(given.folder), np.random.default_rng(0)
+    with Twin.open(given.folder, given.engine, pose="fixed") as twin:
         clouds = [partial_view(twin.body, u, CAMERA, POINTS, NOISE, rng, surface="observed") for u in path]
         sequence = Sequence(twin, "")
         sequence.register(clouds[0])  # everything is prepared
@@ -61,14 +49,14 @@ def main() -> None:
 
         def camera() -> Iterator[Floats]:
             start = time.monotonic()
-            for number in range(int(arguments.seconds * arguments.rate)):
-                time.sleep(max(0.0, start + number / arguments.rate - time.monotonic()))
+            for number in range(int(given.seconds * given.rate)):
+                time.sleep(max(0.0, start + number / given.rate - time.monotonic()))
                 begun.append(time.monotonic())
                 yield clouds[number % len(clouds)]
 
         ages, dropped, verdicts, errors, memory = [], 0, [], [], []
         number = 0
-        for answer in answers(sequence, fed(camera()), arguments.budget):
+        for answer in answers(sequence, fed(camera()), given.budget):
             number += 1 + answer.dropped
             ages.append(answer.age)
             dropped += answer.dropped
@@ -79,22 +67,37 @@ def main() -> None:
             if len(ages) in (50, 500) or len(ages) % 2000 == 0:
                 memory.append((len(ages), resident_mib()))
         memory.append((len(ages), resident_mib()))
-    figures = {
-        **{name: getattr(arguments, name) for name in ("seconds", "rate", "budget", "engine")},
+    return {
+        **{name: getattr(given, name) for name in ("seconds", "rate", "budget", "engine")},
         "clouds": len(begun),
         "answers": len(ages),
         "dropped": dropped,
         "age_ms": {
             name: 1e3 * float(np.quantile(ages, q)) for name, q in (("p50", 0.5), ("p95", 0.95), ("p999", 0.999))
         },
-        "within_budget_and_10_ms": float(np.mean(np.array(ages) <= arguments.budget + 0.01)),
+        "within_budget_and_10_ms": float(np.mean(np.array(ages) <= given.budget + 0.01)),
         "accepted": float(np.mean([verdict == "accepted" for verdict in verdicts])),
         "error_mm": {"mean": 1e3 * float(np.mean(errors)), "max": 1e3 * float(np.max(errors))},
         "resident_mib": memory,
     }
-    print(figures)
-    write("stream", figures)
+
+
+BENCHMARK = Benchmark(
+    name="stream",
+    title="A camera of 60 clouds a second on the quickstart's twin: age of the answers, drops, memory",
+    about=("app", "registration", "surrogate"),
+    work=work,
+    settings={
+        "folder": FOLDER,
+        "seconds": Setting(600.0),
+        "rate": Setting(60.0, "clouds a second"),
+        "budget": Setting(0.1, "seconds"),
+        "engine": Setting("surrogate"),
+    },
+    seeds=(0,),
+    small={"seconds": 3.0},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

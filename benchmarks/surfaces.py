@@ -2,19 +2,19 @@
 
 The surfaces lie in ../shared/data/surfaces. Those of SOFA that are 7 across state no unit and are read as centimetres.
 
-python benchmarks/surfaces.py [--nodes 2000] [--only NAME]
+    python benchmarks/surfaces.py [--nodes 2000] [--only NAME]
 """
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from record import write
+from columns import Column
+from harness import Benchmark, Given, Setting, run
 
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.files import Unit, read_mesh
@@ -101,20 +101,16 @@ def doubled(surface: Surface) -> Surface:
     return Surface(surface.points, np.concatenate([surface.triangles, surface.triangles[:, ::-1]]))
 
 
-DAMAGES: tuple[Callable[[Surface], Surface], ...] = (
-    *(holes, cut_off, unshared, gaping, inward, mixed, crumbs, crossing, doubled),
-)
+_DAMAGES = (holes, cut_off, unshared, gaping, inward, mixed, crumbs, crossing, doubled)
+DAMAGES: dict[str, Callable[[Surface], Surface]] = {each.__name__.replace("_", " "): each for each in _DAMAGES}
 
 
-def surfaces() -> Iterator[tuple[str, Surface]]:
-    """All surfaces by name; of a volume mesh its boundary."""
-    for name, unit in FILES.items():
-        found = read_mesh(SURFACES / name, unit)
-        yield name, found if isinstance(found, Surface) else Body(*found, {}).boundary_surface
-    plain = read_mesh(SURFACES / DAMAGED, FILES[DAMAGED])
-    assert isinstance(plain, Surface)
-    for damage in DAMAGES:
-        yield f"{DAMAGED}, {damage.__name__.replace('_', ' ')}", damage(plain)
+def surface_of(name: str) -> Surface:
+    """A file's surface, damaged where the name says so after a comma; of a volume mesh its boundary."""
+    file, _, damage = name.partition(", ")
+    found = read_mesh(SURFACES / file, FILES[file])
+    surface = found if isinstance(found, Surface) else Body(*found, {}).boundary_surface
+    return DAMAGES[damage](surface) if damage else surface
 
 
 def measure(surface: Surface, nodes: int) -> dict[str, Any]:
@@ -147,27 +143,33 @@ def measure(surface: Surface, nodes: int) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--nodes", type=int, default=2000)
-    parser.add_argument("--only", default="")
-    arguments = parser.parse_args()
+def work(row: str, given: Given) -> dict[str, Any]:
     if not SURFACES.is_dir():
         raise SystemExit(f"skipped: no surfaces in {SURFACES}")
-    print(f"{'surface':<30}{'open':>6}{'parts':>6}{'nodes':>7}{'cells':>7}{'s':>7}{'volume':>8}"
-          f"{'SJ min':>8}{'median':>8}{'edge mm':>9}{'Hausdorff mm':>14}")  # fmt: skip
-    rows: dict[str, Any] = {}
-    for name, surface in surfaces():
-        if arguments.only not in name:
-            continue
-        row = rows[name] = measure(surface, arguments.nodes)
-        print(f"{name:<30}{row['open_edges']:>6}{row['components']:>6}{row['nodes']:>7}{row['cells']:>7}"
-              f"{row['seconds']:>7.1f}{row['volume_ratio']:>8.4f}{row['scaled_jacobian_min']:>8.3f}"
-              f"{row['scaled_jacobian_median']:>8.3f}{1e3 * row['edge_mean_m']:>9.2f}"
-              f"{1e3 * row['hausdorff_m']:>14.2f}", flush=True)  # fmt: skip
-    if not arguments.only:
-        write("surfaces", {"nodes_wanted": arguments.nodes, "surfaces": rows})
+    return measure(surface_of(row), given.nodes)
+
+
+BENCHMARK = Benchmark(
+    name="surfaces",
+    title="Organ surfaces as strangers bring them, and damaged ones, made solid",
+    about=("meshes",),
+    work=work,
+    rows=(*FILES, *(f"{DAMAGED}, {name}" for name in DAMAGES)),
+    columns=(
+        Column("open edges; components", "", "{open_edges}; {components}"),
+        Column("nodes; cells", "", "{nodes}; {cells}"),
+        Column("time", "s", "{seconds:.1f}"),
+        Column("volume after / before", "", "{volume_ratio:.4f}"),
+        Column("scaled Jacobian: least; median", "", "{scaled_jacobian_min:.3f}; {scaled_jacobian_median:.3f}"),
+        Column("mean edge", "mm", "{edge_mean_m*1000:.2f}"),
+        Column("Hausdorff distance", "mm", "{hausdorff_m*1000:.2f}"),
+    ),
+    settings={"nodes": Setting(2000, "wanted")},
+    seeds=(SEED,),
+    under="surfaces",
+    finish=lambda figures, given: {"nodes_wanted": given.nodes},
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK)

@@ -1,6 +1,6 @@
 """Equilibria a second on the real liver, by ranks: linear tetrahedra and the thesis's grid of hexahedra.
 
-    python benchmarks/throughput.py [--bodies tetrahedra grid "grid, from a network"] [--ranks 1 2] [--draws 1024]
+    python benchmarks/throughput.py [--only tetrahedra "grid, 2 ranks" ...] [--draws 1024]
 
 Draws loads as table 4.3 does (1 to 5 patches, the largest scaled to 55 mm) and makes a data set from nothing under
 mpirun, Jacobians left out. Every draw counts, rejected ones too; what comes before the first draw (modes, linear
@@ -11,22 +11,21 @@ the rate either. Wants an idle machine.
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import made
 import numpy as np
-from networks import RUNS
+from columns import Column
+from harness import Benchmark, Given, Setting, run, started
 from networks_bodies import data_of, liver, tetrahedral_liver
-from record import recorded, write
+from record import RUNS
 
 from softtwin.reference.data.dataset import SPLITS, DataSet
 from softtwin.reference.data.samplers import LoadPlan
@@ -35,9 +34,8 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
-from softtwin.surrogate.twin import CARD, load, save
+from softtwin.surrogate.twin import load
 
-NAME = "throughput"
 HELD_OUT, WANTED = 16, 20480
 
 
@@ -48,8 +46,8 @@ NETWORK = RUNS / "throughput-network"
 
 def trained(ranks: int, seconds: float) -> None:
     """The network that solves may start from; what is there is not made again."""
-    if not (NETWORK / CARD).exists():
-        save(train(data_of("liver", ranks), TrainingPlan(Reduced(), seconds=seconds, samples=1024)), NETWORK)
+    plan = TrainingPlan(Reduced(), seconds=seconds, samples=1024)
+    made.network(NETWORK, liver(), lambda: train(data_of("liver", ranks), plan))
 
 
 @cache
@@ -63,16 +61,17 @@ def solve_from_network(path: str, block: int) -> int:
     return solve_block(path, block, opened())
 
 
-def make(name: str, draws: int, folder: Path) -> None:
+def make(name: str, count: str, folder: str) -> None:
     """Make the data set, on all ranks that mpirun started; rank 0 writes how long all of it took."""
+    draws, place = int(count), Path(folder)
     samples = {"train": draws - 2 * HELD_OUT, "validation": HELD_OUT, "test": HELD_OUT}
     plan = Plan("neo-hookean", 5000.0, 0.45, LoadPlan(patches=5, displacement=0.055), samples)
     began = time.time()
     task = solve_from_network if name == FROM_NETWORK else None
-    data = generate(folder / "data.zarr", BODIES[name](), plan, task=task)
+    data = generate(place / "data.zarr", BODIES[name](), plan, task=task)
     if data is not None:
         prepared = (data.path / "zarr.json").stat().st_mtime  # the header is written when all is prepared
-        (folder / "times.json").write_text(
+        (place / "times.json").write_text(
             json.dumps({"prepare_s": prepared - began, "solve_s": time.time() - prepared})
         )
 
@@ -80,10 +79,7 @@ def make(name: str, draws: int, folder: Path) -> None:
 def measured(name: str, ranks: int, draws: int) -> dict[str, Any]:
     """One run in processes of its own."""
     with tempfile.TemporaryDirectory() as kept:
-        command = [sys.executable, __file__, "--make", name, "--draws", str(draws), "--folder", kept]
-        if ranks > 1:
-            command = ["mpirun", "--oversubscribe", "--bind-to", "core", "-n", str(ranks), *command]
-        subprocess.run(command, check=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+        started(__file__, "make", name, str(draws), kept, ranks=ranks, bind="core")
         times = json.loads((Path(kept) / "times.json").read_text())
         data = DataSet(Path(kept) / "data.zarr")
         figures = [data.figures(split) for split in SPLITS if len(data.split_draws(split))]
@@ -103,35 +99,47 @@ def measured(name: str, ranks: int, draws: int) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bodies", nargs="+", default=list(BODIES), choices=list(BODIES))
-    parser.add_argument("--ranks", nargs="+", type=int, default=[1, 2])
-    parser.add_argument("--draws", type=int, default=1024)
-    parser.add_argument("--seconds", type=float, default=300.0, help="of the network's training")
-    parser.add_argument("--name", default=NAME, help="of the record")
-    parser.add_argument("--make", default="", help="make one data set alone, and end")
-    parser.add_argument("--folder", type=Path, help="of that data set")
-    arguments = parser.parse_args()
-    if arguments.make:
-        make(arguments.make, arguments.draws, arguments.folder)
-        return
-    found = recorded(arguments.name)
-    for name in arguments.bodies:
-        if name == FROM_NETWORK:
-            trained(max(arguments.ranks), arguments.seconds)
-        for ranks in arguments.ranks:
-            key = f"{name}, {ranks} {'rank' if ranks == 1 else 'ranks'}"
-            if key not in found:
-                found[key] = measured(name, ranks, arguments.draws)
-                write(arguments.name, found)
-            row, alone = found[key], found.get(f"{name}, 1 rank", {}).get("draws_a_second")
-            efficiency = f"{row['draws_a_second'] / alone / ranks:.2f}" if alone else "-"
-            print(
-                f"{key:22} {row['draws_a_second']:.2f} a second, efficiency {efficiency}; 20,480 in "
-                f"{row['hours_for_20480']:.2f} h and {row['prepare_s']:.0f} s before; rejected: {row['rejected']}"
-            )
+ROWS = {f"{name}, {ranks} {'rank' if ranks == 1 else 'ranks'}": (name, ranks) for name in BODIES for ranks in (1, 2)}
+
+
+def work(row: str, given: Given) -> dict[str, Any]:
+    name, ranks = ROWS[row]
+    if name == FROM_NETWORK:
+        trained(given.ranks, given.seconds)
+    return measured(name, ranks, given.draws)
+
+
+def lines(rows: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A line for each row, with its efficiency against one rank."""
+    for key, found in rows.items():
+        name, ranks = ROWS[key]
+        alone = rows.get(f"{name}, 1 rank", {}).get("draws_a_second")
+        more = {"efficiency": found["draws_a_second"] / alone / ranks} if alone else {}
+        yield f"{key}, {found['draws']:,} draws", {**found, **more, "rejected": sum(found["rejected"].values())}
+
+
+BENCHMARK = Benchmark(
+    name="throughput",
+    title="Equilibria a second on the real liver, by ranks: linear tetrahedra and the thesis's grid",
+    about=("reference",),
+    work=work,
+    rows=tuple(ROWS),
+    columns=(
+        Column("draws a second", "", "{draws_a_second:.2f}"),
+        Column("efficiency", "", "{efficiency:.2f}"),
+        Column("20,480 at that rate", "h", "{hours_for_20480:.2f}"),
+        Column("before the first draw", "s", "{prepare_s:.0f}"),
+        Column("rejected", "", "{rejected}"),
+    ),
+    settings={
+        "draws": Setting(1024, "of each row"),
+        "seconds": Setting(300.0, "of the network's training"),
+        "ranks": Setting(2, "that make the network's data", picks=True),
+    },
+    small={"draws": 48},
+    lines=lines,
+)
 
 
 if __name__ == "__main__":
-    main()
+    run(BENCHMARK, parts={"make": make})

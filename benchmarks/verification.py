@@ -1,19 +1,19 @@
 """What the reference solver is checked against, at full size, written as docs/archive/verification.md.
 
-python benchmarks/verification.py [--only closed patch manufactured tangent taylor cook locking | --recorded]
+python benchmarks/verification.py [--only closed patch manufactured tangent taylor cook locking]
+python benchmarks/verification.py page                  # the page alone, from the records
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
-from collections.abc import Callable, Iterable, Sequence
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from record import RESULTS, write
-from threadpoolctl import threadpool_limits
+from columns import markdown
+from harness import Benchmark, Given, run
+from record import recorded
 from verification_cases import PLANE, QUADRATIC, SPACE, compressible, incompressible
 from verification_derivatives import STEPS, frame, tangent, taylor, taylor_cases
 from verification_published import LOAD, YOUNG_MODULUS, cook, cook_tables, cooks, locking, slender_limit
@@ -138,12 +138,6 @@ def lockings() -> Figures:
 # ---------------------------------------------------------------------- the page
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines) + "\n"
-
-
 def tiny(value: float) -> str:
     """A small number with two digits."""
     return f"{value:.1e}"
@@ -156,7 +150,7 @@ def errors(row: Figures, name: str) -> str:
 
 def closed_page(found: Figures) -> str:
     """The section on closed forms."""
-    bars = table(
+    bars = markdown(
         ["material", "lateral stretch", "its error", "stress", "its error", "shear stress", "its error", "universal"],
         (
             [
@@ -172,21 +166,21 @@ def closed_page(found: Figures) -> str:
             for name, row in found["bars"].items()
         ),
     )
-    small = table(
+    small = markdown(
         ["material", "gap at 0.2, 0.1, 0.05", "order"],
         (
             [name, ", ".join(map(tiny, row["gaps"])), f"{row['orders'][-1]:.2f}"]
             for name, row in found["small_torsion"].items()
         ),
     )
-    twist = table(
+    twist = markdown(
         ["material", "torque, finest", "its errors; order", "axial force's errors; order"],
         (
             [name, f"{row['torque'][-1]:.5f}", errors(row, "torque"), errors(row, "force")]
             for name, row in found["torsion"].items()
         ),
     )
-    inflated = table(
+    inflated = markdown(
         ["wall, material, element", "inner radius; order", "displacement, L2; order", "pressure, L2; order"],
         (
             [name, errors(row, "radius"), errors(row, "displacement"), errors(row, "pressure")]
@@ -238,7 +232,7 @@ and forces on inner nodes must vanish; "curved" cells have their inner mid-side 
 side is free and carries the exact traction. Neo-Hookean. Errors relative to the largest displacement, force and
 pressure.
 
-{table(["element", "inner nodes", "displacement", "inner forces", "pressure"], rows)}"""
+{markdown(["element", "inner nodes", "displacement", "inner forces", "pressure"], rows)}"""
 
 
 def manufactured_page(found: Figures) -> str:
@@ -262,7 +256,7 @@ is prescribed on the whole boundary. For incompressible materials the displaceme
 comes with a pressure of its own, and one side is free under the exact traction. Cells are distorted by a smooth map.
 Expected: order 2 in L2 and 1 in H1 for linear, 3 and 2 for quadratic cells, 2 for the pressure.
 
-{table(head, rows)}"""
+{markdown(head, rows)}"""
 
 
 def tangents_page(found: Figures) -> str:
@@ -287,7 +281,7 @@ has none). "Asymmetry": the largest entry of K - K^T relative to K's. "Energy", 
 the deformed body is turned by 110 degrees, forces turned back. Linear elasticity knows small rotations only and
 fails, as it must. Tetrahedra, of 10 nodes where mixed.
 
-{table(head, rows)}"""
+{markdown(head, rows)}"""
 
 
 def taylor_page(found: Figures) -> str:
@@ -324,12 +318,12 @@ order shown is that of the smallest steps whose remainders are above 1e-10 of J 
 or square in 2 cells along an axis, held at one side, whose nodes are displaced; traction on another, a following
 pressure on a third, forces on all nodes, body force.
 
-{table(head, rows)}"""
+{markdown(head, rows)}"""
 
 
 def membranes_page(found: Figures) -> str:
     """The section on what others publish."""
-    meshes = table(
+    meshes = markdown(
         ["version", "element", "cells along a side", "published, mm", "here, mm"],
         (
             [found["limits"][key]["title"], row["element"], row["n"], row["published"], f"{row['found']:.5f}"]
@@ -337,7 +331,7 @@ def membranes_page(found: Figures) -> str:
             for row in rows
         ),
     )
-    limits = table(
+    limits = markdown(
         ["version", "published, mm", *(f"n = {n}" for n in MEMBRANES), "last against published"],
         (
             [
@@ -390,7 +384,7 @@ The cantilever under an end traction of {LOAD:.0f} Pa, isochoric Neo-Hookean: th
 the finest mixed solution (Q2-Q1, {first["finest"]} cells across): {best}.
 P1 and Q1 lock, at 0.4999 beyond use; P2 and Q2 are slower than their mixed forms, which do not feel Poisson's ratio.
 
-{table(["", "element", *(f"{n} across" for n in first["divisions"])], rows)}
+{markdown(["", "element", *(f"{n} across" for n in first["divisions"])], rows)}
 ![Deflection of each element by mesh](../verification-locking.png)
 """
 
@@ -429,34 +423,31 @@ STUDIES: dict[str, tuple[Callable[[], Figures], Callable[[Figures], str]]] = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="+", choices=STUDIES, help="print the sections of these and write nothing")
-    parser.add_argument("--recorded", action="store_true", help="write the page from the records, solving nothing")
-    arguments = parser.parse_args()
-    chosen, figures, sections = arguments.only, {}, []
-    if arguments.recorded:
-        record = json.loads((RESULTS / "verification.json").read_text())["figures"]
-        write_page([page(record[name]) for name, (_, page) in STUDIES.items()])
-        return
-    with threadpool_limits(1):
-        for name in chosen or STUDIES:
-            study, page = STUDIES[name]
-            begin = time.perf_counter()
-            figures[name] = study()
-            sections.append(page(figures[name]))
-            print(f"{name}: {time.perf_counter() - begin:.0f} s", flush=True)
-    if chosen:
-        print("\n".join(sections))
-        return
-    write("verification", figures)
-    draw_locking(figures["locking"], DOCS / "verification-locking.png")
-    write_page(sections)
+def work(row: str, given: Given) -> Figures:
+    study, page = STUDIES[row]
+    found = study()
+    print(page(found))
+    return found
 
 
-def write_page(sections: list[str]) -> None:
-    (DOCS / "archive" / "verification.md").write_text("\n".join([INTRODUCTION, *sections, *recorded_pages()]))
+def pages() -> None:
+    """Write the page from the records, solving nothing."""
+    found = recorded("verification")
+    draw_locking(found["locking"], DOCS / "verification-locking.png")
+    sections = [INTRODUCTION, *(page(found[name]) for name, (_, page) in STUDIES.items()), *recorded_pages()]
+    (DOCS / "archive" / "verification.md").write_text("\n".join(sections))
+
+
+BENCHMARK = Benchmark(
+    name="verification",
+    title="What the reference solver is checked against: closed forms, patch tests, orders, Taylor tests, locking",
+    about=("reference",),
+    work=work,
+    rows=tuple(STUDIES),
+)
 
 
 if __name__ == "__main__":
-    main()
+    made = run(BENCHMARK, parts={"page": pages})
+    if "--dry" not in sys.argv and set(made) == set(STUDIES) and made == recorded("verification"):
+        pages()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
-from record import RESULTS
+from columns import markdown
+from record import recorded
 
 PEERS = ("felupe", "scikit-fem", "torch-fem")
 
@@ -13,42 +13,31 @@ PEERS = ("felupe", "scikit-fem", "torch-fem")
 def recorded_pages() -> list[str]:
     """A section for each record that is there; one that is absent is named."""
     pages = {"peers": _peers, "liver_truth": _liver, "beam_hard": _hard}
-    return [page(_figures(name)) if _figures(name) else f"## {name}\n\nNot run.\n" for name, page in pages.items()]
+    return [page(recorded(name)) if recorded(name) else f"## {name}\n\nNot run.\n" for name, page in pages.items()]
 
 
-def _figures(name: str) -> Any:
-    path = RESULTS / f"{name}.json"
-    return json.loads(path.read_text())["figures"] if path.exists() else None
-
-
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def _peers(found: list[dict[str, Any]]) -> str:
-    rows = [[case["problem"], *(f"{case[peer]['largest_difference_m']:.1e}" for peer in PEERS)] for case in found]
+def _peers(found: dict[str, Any]) -> str:
+    rows = [[name, *(f"{case[peer]['largest_difference_m']:.1e}" for peer in PEERS)] for name, case in found.items()]
     return f"""## Independent codes
 
 `python benchmarks/peers.py`: the same mesh, law, nodal forces and tolerance (1e-8 of the forces) in codes that share
 no line with DOLFINx, in one run. Largest difference of a displacement, metres (the largest displacements are 0.19,
 0.053 and 0.12 m).
 
-{_table(["problem", *PEERS], rows)}
-"""
+{markdown(["problem", *PEERS], rows)}"""
 
 
 def _liver(found: dict[str, Any]) -> str:
     rows = [
         [
             name,
-            f"{found['largest_imbalance_N'][name]:.1e}",
-            ", ".join(f"{found['largest_error_m'][f'{name} {frame}']:.1e}" for frame in (0, 25, 49)),
-            f"{found['lone_movement_mm'][name][0]:.2f}",
-            f"{found['attachments'][name]['largest_gap_mm']:.2f} at node {found['attachments'][name]['at_node']}",
-            f"{found['attachments'][name]['energy_listed_J']:.6f}, {found['attachments'][name]['energy_facets_J']:.6f}",
+            f"{row['largest_imbalance_N']:.1e}",
+            ", ".join(f"{row['largest_error_m'][f'{name} {frame}']:.1e}" for frame in (0, 25, 49)),
+            f"{row['lone_movement_mm'][0]:.2f}",
+            f"{row['attachments']['largest_gap_mm']:.2f} at node {row['attachments']['at_node']}",
+            f"{row['attachments']['energy_listed_J']:.6f}, {row['attachments']['energy_facets_J']:.6f}",
         ]
-        for name in ("s1", "s2", "s3")
+        for name, row in found.items()
     ]
     head = [
         "sequence",
@@ -67,8 +56,7 @@ triangle whose nodes are all listed holds it, and the stored states move it. Wit
 energy higher, and the gap to the stored state largest at that node; from rest and from the stored state one finds the
 same.
 
-{_table(head, rows)}
-"""
+{markdown(head, rows)}"""
 
 
 def _hard(found: dict[str, dict[str, Any]]) -> str:
@@ -86,5 +74,4 @@ def _hard(found: dict[str, dict[str, Any]]) -> str:
 `python benchmarks/beam_hard.py`: random bending and torsion of the thesis's beam (304 hexahedra, E = 4500 Pa, nu =
 0.49; Odot 2023, section 7.2.1: 20 % without a line search, 100 % with it or in load steps).
 
-{_table(["way", "converged", "mean iterations", "median ms"], rows)}
-"""
+{markdown(["way", "converged", "mean iterations", "median ms"], rows)}"""

@@ -34,9 +34,9 @@ from softtwin.meshes.closest import polydata
 from softtwin.meshes.files import read_body, write_body
 from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.calibration import coverage
-from softtwin.surrogate.compact import compacted
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.evaluate import evaluate
+from softtwin.surrogate.low_rank import compressed
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.twin import load, save
 
@@ -71,7 +71,7 @@ def make(folder: Path, work: Path) -> None:
     space = prepare(config(), work)
     make_twin(space, work / "organ.toml", print)
     data = DataSet(space.data)
-    small = measured(compacted(load(space.twin, read_body(space.body)), RANK, LOAD_MODES), data)
+    small = measured(compressed(load(space.twin, read_body(space.body)), RANK, LOAD_MODES), data)
     folder.mkdir(parents=True, exist_ok=True)
     save(small, folder, single=True)
     write_body(folder / "body.vtu", light(read_body(space.body)))
@@ -157,8 +157,8 @@ def distance(one: Path, other: Path) -> float:
         sys.exit("error: the bodies differ; make the twin anew")
     pair = [load(home.folder, home.body) for home in homes]
     forces = np.zeros((4, *bodies[0].points.shape))
-    loaded = pair[0].maps.loaded
-    modes = pair[0].maps.load_modes
+    loaded = pair[0].encoder_decoder.loaded
+    modes = pair[0].encoder_decoder.load_modes
     assert modes is not None
     forces[:, loaded] = modes[:, :4].T.reshape(4, -1, 3)
     moved = np.array([[twin.solve(load_).displacement for load_ in forces] for twin in pair])

@@ -2,7 +2,7 @@
 
     python examples/own_forward_model.py
 
-A state carries its displacement and its own derivatives, `push` and `pull`; nothing needs to be inherited. The model
+A state carries its displacement and its own derivatives, `jvp` and `vjp`; nothing needs to be inherited. The model
 here is a cantilever that bends in proportion to the force at its tip: a matrix of one column. Neither torch nor
 FEniCSx is used.
 """
@@ -31,19 +31,19 @@ class LinearState:
     model: Cantilever
     forces: Floats
     negative_pivots: int | None = 0  # a linear model is never unstable
-    extent: float | None = None  # nor has it learned anything that it could leave
+    extrapolation_ratio: float | None = None  # nor has it learned anything that it could leave
 
     @property
     def displacement(self) -> Floats:
         """(n, 3), metres."""
         return self.model.bent(self.forces)
 
-    def push(self, changes: ArrayLike) -> Floats:
+    def jvp(self, changes: ArrayLike) -> Floats:
         """Change of the displacement, (3n, k), for changes of the forces, (3n, k)."""
         columns = np.asarray(changes).T.reshape(-1, *self.forces.shape)
         return np.stack([self.model.bent(column).ravel() for column in columns], axis=1)
 
-    def pull(self, cotangent: ArrayLike) -> Floats:
+    def vjp(self, cotangent: ArrayLike) -> Floats:
         """Gradient by the forces, (n, 3): the model is its own transpose."""
         return self.model.bent(np.asarray(cotangent))
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
 from softtwin.surrogate.evaluate import evaluate
-from softtwin.surrogate.own_data import data_set_from_arrays
+from softtwin.surrogate.from_arrays import data_set_from_arrays
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
@@ -47,7 +47,7 @@ def main(folder: Path) -> float:
     data = data_set_from_arrays(
         folder / "data.zarr", body, forces, displacements, length_unit="mm", force_unit="N", source="cantilever"
     )
-    surrogate = train(data, TrainingPlan(Reduced(modes=4, width=32, depth=2), epochs=400))
+    surrogate = train(data, TrainingPlan(Reduced(modes=4, width=32, depth=2), epochs=150))
     found = evaluate(surrogate, data)
     print(found)
     return found.relative_error.median

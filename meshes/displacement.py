@@ -25,7 +25,7 @@ from .files import FileError, discard, unstructured_grid
 
 Direction = Literal["forward", "inverse"]
 VOXELS = 64  # along the organ's longest side, where no spacing is told
-MOST_VOXELS = 512  # along any side: more would be gigabytes
+MAXIMUM_VOXELS = 512  # along any side: more would be gigabytes
 _RIM = 2  # voxels about the organ that carry its surface's movement on
 _SPACES: Mapping[str, str] = {"lps": "left-posterior-superior", "ras": "right-anterior-superior"}
 _MEANINGS: Mapping[str, str] = {
@@ -216,10 +216,10 @@ def _field(direction: Direction, body: Body, nodes: Floats, vectors: Floats, spa
     """Vectors of the nodes, which lie where they are asked for, at the voxels about them."""
     edge = spacing or float(np.ptp(body.points, axis=0).max()) / VOXELS
     low, high = nodes.min(axis=0) - (_RIM + 1) * edge, nodes.max(axis=0) + (_RIM + 1) * edge
-    if not 0.0 < edge < np.inf or (high - low).max() / edge > MOST_VOXELS:
+    if not 0.0 < edge < np.inf or (high - low).max() / edge > MAXIMUM_VOXELS:
         raise ValueError(
-            f"spacing: expected an edge in metres of at least {(high - low).max() / MOST_VOXELS:.2g}, got {spacing:g}: "
-            f"more than {MOST_VOXELS} voxels along a side."
+            f"spacing: expected an edge of at least {(high - low).max() / MAXIMUM_VOXELS:.2g} m, got {spacing:g}: "
+            f"more than {MAXIMUM_VOXELS} voxels along a side."
         )
     counts = np.ceil((high - low) / edge).astype(int) + 1
     found, inside = _probed(body, nodes, vectors, low, edge, counts)

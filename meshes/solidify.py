@@ -19,7 +19,7 @@ from .smoothing import Flags, improved, outer_faces, used_points
 from .tetwild import tetrahedra
 
 _log = logging.getLogger(__name__)
-MOST_NODES = 200_000  # fTetWild would take hours for more, and a wrong unit asks for billions
+MAXIMUM_NODES = 200_000  # fTetWild would take hours for more, and a wrong unit asks for billions
 _LOWEST_QUALITY = 1e-3  # radius ratio below which a tetrahedron is a sliver that no solver should meet
 _GOOD_JACOBIAN = 0.25  # scaled: cells below are mended where that goes
 # How far the boundary may lie from the surface: this part of its size, or for coarse cells this part of their edge.
@@ -114,7 +114,7 @@ def solidify(surface: Surface, cell_size: float | None = None, node_count: int |
     Raises:
         SurfaceError: no solid came, or only one with slivers.
         ValueError: neither or both of `cell_size` and `node_count`, one out of its range, or more nodes than
-            `MOST_NODES`.
+            `MAXIMUM_NODES`.
     """
     _check_wish(cell_size, node_count)
     ordered, defects = put_in_order(surface)
@@ -138,7 +138,7 @@ def solidify(surface: Surface, cell_size: float | None = None, node_count: int |
 
 
 def check_node_count(surface: Surface, cell_size: float) -> None:
-    """Refuse a cell size that would make more nodes than `MOST_NODES`.
+    """Refuse a cell size that would make more nodes than `MAXIMUM_NODES`.
 
     Args:
         surface: closed surface, metres.
@@ -148,10 +148,10 @@ def check_node_count(surface: Surface, cell_size: float) -> None:
         ValueError: with the number of nodes that would come.
     """
     count = _node_estimate(surface, cell_size)
-    if count > MOST_NODES:
+    if count > MAXIMUM_NODES:
         raise ValueError(
             f"cell_size: {cell_size:g} m in a surface {np.ptp(surface.points, axis=0).max():.3g} m across makes about "
-            f"{count:.2g} nodes, expected at most {MOST_NODES}; is the surface in another unit (--unit mm)? "
+            f"{count:.2g} nodes, expected at most {MAXIMUM_NODES}; is the surface in another unit (--unit mm)? "
             "cell_size is in metres."
         )
 
@@ -161,8 +161,8 @@ def _check_wish(cell_size: float | None, node_count: int | None) -> None:
         raise ValueError("solidify: expected one of cell_size and node_count, got neither or both.")
     if cell_size is not None and not 0 < cell_size < np.inf:
         raise ValueError(f"cell_size: expected a positive length in metres, got {cell_size}.")
-    if node_count is not None and not 20 <= node_count <= MOST_NODES:
-        raise ValueError(f"node_count: expected 20 to {MOST_NODES}, got {node_count}.")
+    if node_count is not None and not 20 <= node_count <= MAXIMUM_NODES:
+        raise ValueError(f"node_count: expected 20 to {MAXIMUM_NODES}, got {node_count}.")
 
 
 def _node_estimate(surface: Surface, cell_size: float) -> float:

@@ -37,9 +37,9 @@ from .data.dataset import (
 from .data.lock import locked
 from .data.materials import MATERIALS, Material
 from .data.outcome import Equilibrium, NotConverged
-from .data.part import Part, at_work_on, refuse_parts_at_work
 from .data.samplers import LoadPlan, QuasiRandom, check_loads, draw_load, loaded_nodes, sobol_point
 from .data.schema import Reason
+from .data.shard import Shard, at_work_on, refuse_shards_at_work
 from .data.writing import create, drop_block, write_block
 from .farm import Task, quiet, share_out
 from .fem.fenicsx import MPI, PETSc, dolfinx
@@ -130,7 +130,7 @@ def generate(
     comm: Any = MPI.COMM_WORLD,
     redo: Sequence[int] = (),
     again: bool = False,
-    part: Part | None = None,
+    part: Shard | None = None,
     task: Task | None = None,
 ) -> DataSet | None:
     """Make a data set, or go on with one that was interrupted; collective over the communicator.
@@ -168,7 +168,7 @@ def generate(
             if part is not None:
                 return Path(path), _prepare_part(Path(path), body, plan, part, held)
             held.enter_context(writing(Path(path)))
-            refuse_parts_at_work(Path(path))
+            refuse_shards_at_work(Path(path))
             return Path(path), _prepare(Path(path), body, plan, redo, again)
 
         folder, blocks = on_first(comm, prepare) or (None, [])
@@ -185,7 +185,7 @@ def writing(path: Path, patience: float = _PATIENCE_S) -> Iterator[None]:
         yield
 
 
-def _prepare_part(path: Path, body: Body, plan: Plan, part: Part, held: ExitStack) -> list[int]:
+def _prepare_part(path: Path, body: Body, plan: Plan, part: Shard, held: ExitStack) -> list[int]:
     """The blocks of a part that are to be solved; who comes while another prepares the data set waits for that."""
     path.parent.mkdir(parents=True, exist_ok=True)
     held.enter_context(at_work_on(path, part))
@@ -194,7 +194,7 @@ def _prepare_part(path: Path, body: Body, plan: Plan, part: Part, held: ExitStac
 
 
 def _prepare(
-    path: Path, body: Body, plan: Plan, redo: Sequence[int], again: bool, part: Part | None = None
+    path: Path, body: Body, plan: Plan, redo: Sequence[int], again: bool, part: Shard | None = None
 ) -> list[int]:
     """Make the data set where there is none; returns the numbers of the blocks to solve."""
     check_loads(body, plan.loads)
@@ -219,7 +219,7 @@ def _prepare(
     return _solvable(create(path, header, body, response, modes.shapes, modes.eigenvalues))
 
 
-def _unfinished(present: DataSet, redo: Sequence[int], part: Part | None) -> list[int]:
+def _unfinished(present: DataSet, redo: Sequence[int], part: Shard | None) -> list[int]:
     count = present.block_count
     wrong = [block for block in redo if not 0 <= block < count]
     if wrong:

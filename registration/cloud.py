@@ -55,15 +55,15 @@ class Cloud:
         """Whether it has the shape of a cloud, and all coordinates are numbers."""
         return self.points.ndim == 2 and self.points.shape[1] == _POINTS and bool(np.isfinite(self.points).all())
 
-    def thinned(self, most: int) -> Cloud:
+    def thinned(self, maximum: int) -> Cloud:
         """So many points at most, spread evenly; the same where there are no more.
 
         Args:
-            most: points wanted.
+            maximum: points wanted.
         """
-        if len(self) <= most:
+        if len(self) <= maximum:
             return self
-        kept = thinned(self.points, most)
+        kept = thinned(self.points, maximum)
         return Cloud(self.points[kept], None if self.normals is None else self.normals[kept])
 
     def distinct(self) -> Cloud:
@@ -76,7 +76,7 @@ class Cloud:
         return Cloud(self.points[kept], None if self.normals is None else self.normals[kept])
 
     @cached_property
-    def across(self) -> Floats | None:
+    def tangent_basis(self) -> Floats | None:
         """Two unit vectors across each normal and each other, (p, 2, 3); zeros where none was measured."""
         if self.normals is None:
             return None

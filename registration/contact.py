@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.meshes.body import Body
 from softtwin.reference.data.inputs import Change, Inputs
 
-from .conditions import Conditions, Estimate, check_deviation, estimate
+from .parameter_blocks import Estimate, ParameterBlocks, check_deviation, estimate
+from .priors import known_forces
 from .registrar import Registrar
 from .result import Registration
-from .unknowns import known_forces
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -160,10 +160,10 @@ class ContactRegistrar:
         draft = replace(draft, draft=draft)
         if not draft.judgement.is_usable:
             return replace(draft, seconds=time.perf_counter() - begin)
-        found = self._registrar(draft).believing(draft.problem.correlated).register(cloud)
-        least = max(draft.scatter, self.anywhere.noise.least)
-        if found.scatter > _WORSE * least:
-            found = found.doubted(
+        found = self._registrar(draft).with_prior(draft.problem.correlated).register(cloud)
+        minimum = max(draft.scatter, self.anywhere.noise.minimum)
+        if found.scatter > _WORSE * minimum:
+            found = found.with_reason(
                 f"one contact does not explain the cloud: points lie {1e3 * found.scatter:.2f} mm from the surface, "
                 f"with forces anywhere {1e3 * draft.scatter:.2f} mm"
             )
@@ -177,8 +177,8 @@ class ContactRegistrar:
         size = self.patch.force or max(float(np.linalg.norm(draft.net_force)), 1e-12)
         contact = Contact(nodes, middle, _REACH * body.size, self.patch.radius, size)
         # What neighbours are missed by alike is for forces anywhere to tell: here it would hide a second contact.
-        gathering = replace(anywhere.options.gathering, rounds=0)
-        options = replace(anywhere.options, gathering=gathering, correlated=False)
+        localisation = replace(anywhere.options.localisation, rounds=0)
+        options = replace(anywhere.options, localisation=localisation, correlated=False)
         return Registrar(
             anywhere.model,
             anywhere.observed,
@@ -186,6 +186,6 @@ class ContactRegistrar:
             options,
             pose=anywhere.pose,
             expectations=anywhere.expectations,
-            conditions=Conditions(body, {}, (contact,)),
+            parameter_blocks=ParameterBlocks(body, {}, (contact,)),
             modulus_deviation=anywhere.modulus_deviation,
         )

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 
-from .evidence import Scale
+from .hyperparameters import LogNormalPrior
 
 Floats = NDArray[np.float64]
 _ASKED, _FEWEST = 300, 30  # points that the evidence is taken from, and of which it is
@@ -67,8 +67,8 @@ class CorrelatedNoise:
         """
         every = slice(None, None, -(-len(points) // _CHOSEN))
         points, normals = points[every], normals[every]
-        alike = _nearness(points, points, length) * (normals @ normals.T)
-        _, pivots, rank, _ = dpstrf(alike, tol=_LEFT)
+        inflation_factor = _nearness(points, points, length) * (normals @ normals.T)
+        _, pivots, rank, _ = dpstrf(inflation_factor, tol=_LEFT)
         chosen = pivots[: min(int(rank), _MOST)] - 1
         return cls(size, length, points[chosen], normals[chosen])
 
@@ -92,9 +92,9 @@ class CorrelatedNoise:
     @cached_property
     def _mixing(self) -> Floats:
         """From coefficients to weights of the points that carry the noise, (q, q), metres."""
-        alike = _nearness(self.centres, self.centres, self.length) * (self.normals @ self.normals.T)
-        alike[np.diag_indices(self.count)] += _ROUND_OFF
-        return self.size * solve_triangular(cholesky(alike, lower=True), np.eye(self.count), lower=True).T
+        inflation_factor = _nearness(self.centres, self.centres, self.length) * (self.normals @ self.normals.T)
+        inflation_factor[np.diag_indices(self.count)] += _ROUND_OFF
+        return self.size * solve_triangular(cholesky(inflation_factor, lower=True), np.eye(self.count), lower=True).T
 
     def shifts(self, coefficients: Floats, near: Floats, normals: Floats) -> Floats:
         """What some coefficients, (q,), make of the distances, (p,), metres; see `patterns`."""
@@ -150,7 +150,9 @@ def is_noise(size: float) -> bool:
     return size < _BELOW * _LARGEST
 
 
-def find_correlated(linear: Linear, noise: Scale, force: Scale, worth: float) -> tuple[float, float] | None:
+def find_correlated(
+    linear: Linear, noise: LogNormalPrior, force: LogNormalPrior, worth: float
+) -> tuple[float, float] | None:
     """Size and length of the noise that neighbours share, metres; None where the cloud does without.
 
     A size near the largest (`is_noise`) would be larger, if it might: it stands for what no force explains.
@@ -169,13 +171,13 @@ def find_correlated(linear: Linear, noise: Scale, force: Scale, worth: float) ->
         return None
     by_forces, others = some.forces @ some.forces.T, some.beside @ some.beside.T + np.diag(some.left_out**2)
     squares, facing = cdist(some.points, some.points, "sqeuclidean"), some.normals @ some.normals.T
-    beliefs = [noise, force, Scale(_SIZE, _SIZE_SPREAD), Scale(_LENGTH * extent, _LENGTH_SPREAD)]
-    known = np.array([belief.spread == 0.0 for belief in beliefs])
-    medians = np.array([belief.median for belief in beliefs])
+    hyperpriors = [noise, force, LogNormalPrior(_SIZE, _SIZE_SPREAD), LogNormalPrior(_LENGTH * extent, _LENGTH_SPREAD)]
+    known = np.array([hyperprior.spread == 0.0 for hyperprior in hyperpriors])
+    medians = np.array([hyperprior.median for hyperprior in hyperpriors])
 
     def unlikely(logarithms: Floats) -> float:
         scales = np.where(known[: len(logarithms)], medians[: len(logarithms)], np.exp(logarithms))
-        scales[0] = max(scales[0], noise.least)
+        scales[0] = max(scales[0], noise.minimum)
         if len(scales) > 2 and (scales[2] > _LARGEST or scales[3] > _LONGEST * extent):
             return _NEVER
         covariance = others + scales[1] ** 2 * by_forces
@@ -188,22 +190,22 @@ def find_correlated(linear: Linear, noise: Scale, force: Scale, worth: float) ->
             return _NEVER
         off = solve_triangular(factor, some.data, lower=True, check_finite=False)
         believed = sum(
-            ((log - np.log(belief.median)) / belief.spread) ** 2
-            for log, belief in zip(logarithms, beliefs, strict=False)
-            if belief.spread > 0.0
+            ((log - np.log(hyperprior.median)) / hyperprior.spread) ** 2
+            for log, hyperprior in zip(logarithms, hyperpriors, strict=False)
+            if hyperprior.spread > 0.0
         )
         return 0.5 * float(off @ off + believed) + float(np.log(np.diag(factor)).sum())
 
     def best(count: int, starts: list[list[float]]) -> tuple[float, Floats]:
         options = {"xatol": _EXACT, "fatol": 0.1, "maxfev": _EVALUATIONS}
         found = [minimize(unlikely, np.log(start), method="Nelder-Mead", options=options) for start in starts]
-        least = min(found, key=lambda one: one.fun)
-        return float(least.fun), np.exp(least.x)
+        minimum = min(found, key=lambda one: one.fun)
+        return float(minimum.fun), np.exp(minimum.x)
 
-    median = [max(noise.median, noise.least), force.median]
+    median = [max(noise.median, noise.minimum), force.median]
     with threadpool_limits(1, "blas"):  # for matrices of this size several threads only wait for each other
-        without, _ = best(2, [median, [max(_QUIET * noise.median, noise.least), _STRONG * force.median]])
-        with_it, scales = best(4, [[*median, _SIZE, factor * beliefs[3].median] for factor in _STARTS])
+        without, _ = best(2, [median, [max(_QUIET * noise.median, noise.minimum), _STRONG * force.median]])
+        with_it, scales = best(4, [[*median, _SIZE, factor * hyperpriors[3].median] for factor in _STARTS])
     if without - with_it < worth:
         return None
     return float(scales[2]), float(scales[3])

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
 
-from .conditions import Conditions
+from .parameter_blocks import ParameterBlocks
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -30,13 +30,13 @@ class State(Protocol):
         """Negative pivots of the tangent: 0 is stable, None where the model does not know."""
 
     @property
-    def extent(self) -> float | None:
+    def extrapolation_ratio(self) -> float | None:
         """How far the load lies out: 1 at the largest that the model has learned; None for a model without a limit."""
 
-    def push(self, changes: ArrayLike) -> Floats:
+    def jvp(self, changes: ArrayLike) -> Floats:
         """Change of the displacement, (3n, k), for small changes of the forces, (3n, k)."""
 
-    def pull(self, cotangent: ArrayLike) -> Floats:
+    def vjp(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3), from the one with respect to the displacement, (n, 3).
 
         Several at once have the shape (k, n, 3), and so have their gradients.
@@ -107,13 +107,13 @@ class ReducedState(Protocol):
         """First-order displacement of every so-manieth chosen node, (p, 3), for a change of the coefficients, (k,)."""
 
 
-class ConditionedState(ReducedState, Protocol):
+class ParametrisedState(ReducedState, Protocol):
     """One that also depends on conditions: what the body is made of, and how it is moved."""
 
-    def by_conditions(self) -> Floats:
+    def by_parameters(self) -> Floats:
         """Derivative of all nodes' displacement by the conditions' coefficients, (3n, c)."""
 
-    def rows_by_conditions(self, rows: csr_array) -> Floats:
+    def rows_by_parameters(self, rows: csr_array) -> Floats:
         """Derivative of linear functions of the chosen displacements, (q, c), for rows (q, 3p)."""
 
 
@@ -131,10 +131,10 @@ class ReducedModel(Protocol):
         """The state for coefficients (k,)."""
 
 
-class ConditionedModel(ReducedModel, Protocol):
+class ParametrisedModel(ReducedModel, Protocol):
     """One whose states also depend on conditions."""
 
-    def solve(self, coefficients: Floats, near: Any = None, unknown: Floats | None = None) -> ConditionedState:
+    def solve(self, coefficients: Floats, near: Any = None, unknown: Floats | None = None) -> ParametrisedState:
         """The state for coefficients of forces, (k,), and of conditions, (c,)."""
 
 
@@ -153,8 +153,8 @@ class _PickedState:
     def _basis_pushed(self) -> Floats:
         if self.model.count == 0:
             return np.zeros((len(self.model.rows), 0))
-        pushed: Floats = self.full.push(self.model.basis)[self.model.rows]
-        return self.model.growth(self.unknown)[0] * pushed
+        pushed: Floats = self.full.jvp(self.model.basis)[self.model.rows]
+        return self.model.stiffness_scaling(self.unknown)[0] * pushed
 
     def jacobian(self, rows: csr_array) -> Floats:
         return rows @ self._basis_pushed
@@ -164,24 +164,24 @@ class _PickedState:
 
     @cached_property
     def _conditions_pushed(self) -> Floats:
-        conditions = self.model.conditions
-        assert conditions is not None
-        changes = conditions.changes(self.unknown)
-        forces, (_, slopes) = self.model.forces(self.coefficients), self.model.growth(self.unknown)
+        parameter_blocks = self.model.parameter_blocks
+        assert parameter_blocks is not None
+        changes = parameter_blocks.changes(self.unknown)
+        forces, (_, slopes) = self.model.forces(self.coefficients), self.model.stiffness_scaling(self.unknown)
         for place in np.flatnonzero(slopes):
             changes[place] = replace(changes[place], forces=slopes[place] * forces)
-        if conditions.has_forces_alone:
-            pushed: Floats = self.full.push(
+        if parameter_blocks.has_forces_alone:
+            pushed: Floats = self.full.jvp(
                 np.stack([np.asarray(change.forces, dtype=np.float64).ravel() for change in changes], axis=1)
             )
         else:
-            pushed = self.full.push_inputs(changes)
+            pushed = self.full.jvp_inputs(changes)
         return pushed
 
-    def by_conditions(self) -> Floats:
+    def by_parameters(self) -> Floats:
         return self._conditions_pushed
 
-    def rows_by_conditions(self, rows: csr_array) -> Floats:
+    def rows_by_parameters(self, rows: csr_array) -> Floats:
         return rows @ self._conditions_pushed[self.model.rows]
 
     def is_at(self, model: _PickedModel, coefficients: Floats, unknown: Floats) -> bool:
@@ -193,8 +193,8 @@ class _PickedState:
 class _PickedModel:
     """Any forward model, reduced by multiplying with the basis and picking rows."""
 
-    def __init__(self, model: Any, nodes: Ints, basis: Floats, conditions: Conditions | None) -> None:
-        self.model, self.nodes, self.basis, self.conditions = model, nodes, basis, conditions
+    def __init__(self, model: Any, nodes: Ints, basis: Floats, parameter_blocks: ParameterBlocks | None) -> None:
+        self.model, self.nodes, self.basis, self.parameter_blocks = model, nodes, basis, parameter_blocks
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
 
     @property
@@ -206,31 +206,33 @@ class _PickedModel:
         found: Floats = (self.basis @ coefficients).reshape(-1, 3)
         return found
 
-    def growth(self, unknown: Floats) -> tuple[float, Floats]:
-        """See `Conditions.growth`."""
-        return (1.0, np.zeros(0)) if self.conditions is None else self.conditions.growth(unknown)
+    def stiffness_scaling(self, unknown: Floats) -> tuple[float, Floats]:
+        """See `ParameterBlocks.stiffness_scaling`."""
+        return (1.0, np.zeros(0)) if self.parameter_blocks is None else self.parameter_blocks.stiffness_scaling(unknown)
 
     def combined(self, matrix: Floats) -> _PickedModel:
-        return _PickedModel(self.model, self.nodes, self.basis @ matrix, self.conditions)
+        return _PickedModel(self.model, self.nodes, self.basis @ matrix, self.parameter_blocks)
 
     def solve(self, coefficients: Floats, near: ReducedState | None = None, unknown: Floats | None = None) -> Any:
         """The state; conditions are as expected where no coefficients of theirs are given."""
         if unknown is None:
-            unknown = np.zeros(0 if self.conditions is None else self.conditions.count)
+            unknown = np.zeros(0 if self.parameter_blocks is None else self.parameter_blocks.count)
         if isinstance(near, _PickedState) and near.is_at(self, coefficients, unknown):
             return near
-        forces = self.growth(unknown)[0] * self.forces(coefficients)
+        forces = self.stiffness_scaling(unknown)[0] * self.forces(coefficients)
         start = None if near is None else near.full
-        if self.conditions is None:
+        if self.parameter_blocks is None:
             return _PickedState(self, coefficients, unknown, self.model.solve(forces, start))
-        if self.conditions.has_forces_alone:
-            full = self.model.solve(forces + self.conditions.forces(unknown), start)
+        if self.parameter_blocks.has_forces_alone:
+            full = self.model.solve(forces + self.parameter_blocks.forces(unknown), start)
         else:
-            full = self.model.solve(forces, start, self.conditions.inputs(unknown))
+            full = self.model.solve(forces, start, self.parameter_blocks.inputs(unknown))
         return _PickedState(self, coefficients, unknown, full)
 
 
-def reduce_model(model: Any, nodes: Ints, basis: Floats, conditions: Conditions | None = None) -> ReducedModel:
+def reduce_model(
+    model: Any, nodes: Ints, basis: Floats, parameter_blocks: ParameterBlocks | None = None
+) -> ReducedModel:
     """A model from force coefficients to the displacement of some nodes.
 
     A model that has a `reduced` of its own (surrogates multiply beforehand) is asked for it.
@@ -239,17 +241,17 @@ def reduce_model(model: Any, nodes: Ints, basis: Floats, conditions: Conditions 
         model: a forward model.
         nodes: numbers of the nodes whose displacement is wanted, (p,).
         basis: nodal forces of each coefficient, (3n, k), newtons.
-        conditions: unknowns beside the forces, which the model takes as inputs.
+        parameter_blocks: unknowns beside the forces, which the model takes as inputs.
 
     Raises:
         ValueError: the model was learned for one material and one support, and there are such unknowns.
     """
-    every_model_takes_them = conditions is not None and conditions.has_forces_alone
+    every_model_takes_them = parameter_blocks is not None and parameter_blocks.has_forces_alone
     if not hasattr(model, "reduced") or every_model_takes_them:
-        return _PickedModel(model, nodes, basis, conditions)
-    if conditions is not None:
+        return _PickedModel(model, nodes, basis, parameter_blocks)
+    if parameter_blocks is not None:
         raise ValueError(
-            "conditions: expected a model that takes other parameters and prescribed displacements (the reference, or "
+            "parameter_blocks: expected a model that takes parameters and prescribed displacements (the reference, or "
             f"hybrid), got a {type(model).__name__}, which has learned one material and one support."
         )
     found: ReducedModel = model.reduced(nodes, basis)

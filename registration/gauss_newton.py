@@ -14,14 +14,14 @@ from scipy.linalg import cho_factor, cho_solve
 
 from softtwin.reference.data.outcome import NotConverged
 
-from . import marks
+from . import landmarks
 from .correlated import find_correlated
-from .evidence import Scales, find_scales, linearised
-from .independence import inflation
+from .hyperparameters import Hyperparameters, estimate_hyperparameters, linearised
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .posterior import Posterior, posterior
-from .problem import Problem, Trial
+from .problem import Evaluation, Problem
+from .residual_correlation import variance_inflation
 
 Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
@@ -32,7 +32,7 @@ _UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
 
 
 @dataclass(frozen=True)
-class Step:
+class IterationRecord:
     """One iteration.
 
     Args:
@@ -55,11 +55,11 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SolverResult:
     """Where a solver ended.
 
     Args:
-        trial: the problem at the coefficients returned.
+        evaluation: the problem at the coefficients returned.
         weights: of the points at the end, (p,).
         posterior: there.
         outcome: how it ended.
@@ -68,18 +68,20 @@ class Found:
         local: the objective's model there.
     """
 
-    trial: Trial
+    evaluation: Evaluation
     weights: Floats
     posterior: Posterior
     outcome: Outcome
     evaluations: int
-    trace: tuple[Step, ...]
+    trace: tuple[IterationRecord, ...]
     local: LocalModel
 
     @classmethod
-    def at(cls, local: LocalModel, outcome: Outcome, evaluations: int, trace: tuple[Step, ...]) -> Found:
+    def at(
+        cls, local: LocalModel, outcome: Outcome, evaluations: int, trace: tuple[IterationRecord, ...]
+    ) -> SolverResult:
         """What is found where a model of the objective was taken."""
-        return cls(local.trial, local.weights, local.posterior(), outcome, evaluations, trace, local)
+        return cls(local.evaluation, local.weights, local.posterior(), outcome, evaluations, trace, local)
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ class GaussNewton:
         handed_on: the same for all losses but the last.
         graduation: the noise is taken as at least this part of what the linear model promises to change.
         max_step: first limit on the movement of any observed node in one step, part of the body's size.
-        least_step: no step that moves all observed nodes less than this is tried, metres.
+        minimum_step: no step that moves all observed nodes less than this is tried, metres.
         trusted: before the end closest points are searched anew, of points further from the surface than so many of
             their deviations; 0 for all.
         until: no step is begun after this time of the monotonic clock, seconds.
@@ -113,14 +115,14 @@ class GaussNewton:
     handed_on: float = 1.0
     graduation: float = 1.0
     max_step: float = 0.05
-    least_step: float = 1e-6
+    minimum_step: float = 1e-6
     trusted: float = 0.0
     until: float = np.inf
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
             raise ValueError(f"GaussNewton.max_iterations: expected at least 1, got {self.max_iterations}.")
-        for name in ("settled", "enough", "handed_on", "max_step", "least_step"):
+        for name in ("settled", "enough", "handed_on", "max_step", "minimum_step"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"GaussNewton.{name}: expected a positive number, got {getattr(self, name)}.")
 
@@ -145,7 +147,7 @@ class GaussNewton:
         """The same, which takes any start for the end: to judge it."""
         return replace(self, losses=self.losses[:1], settled=1e9, handed_on=1e9, graduation=0.0)
 
-    def solve(self, problem: Problem, start: Floats, near: Trial | None = None) -> Found:
+    def solve(self, problem: Problem, start: Floats, near: Evaluation | None = None) -> SolverResult:
         """The coefficients that minimise the robust distance plus the prior.
 
         Args:
@@ -158,50 +160,52 @@ class GaussNewton:
         """
         return _Search(self, problem, start, near).run()
 
-    def has_settled(self, problem: Problem, trial: Trial, noise: float) -> bool:
+    def has_settled(self, problem: Problem, evaluation: Evaluation, noise: float) -> bool:
         """Whether no step would be taken from a trial, its closest points left as they are.
 
         Args:
             problem: what is registered.
-            trial: where.
+            evaluation: where.
             noise: standard deviation of a point's distance as far as it is known, metres.
         """
-        local = LocalModel(problem, trial, self.losses[-1], noise, self.graduation)
+        local = LocalModel(problem, evaluation, self.losses[-1], noise, self.graduation)
         return local.length < self.settled and not local.is_graduated
 
 
 class _Search:
     """One run of the solver: where it is, how far it may step, what it has seen."""
 
-    def __init__(self, options: GaussNewton, problem: Problem, start: Floats, near: Trial | None) -> None:
+    def __init__(self, options: GaussNewton, problem: Problem, start: Floats, near: Evaluation | None) -> None:
         self.options, self.problem = options, problem
-        self.trial = _begun(problem, start, near)
+        self.evaluation = _begun(problem, start, near)
         self.evaluations, self.limit = 1, self._first_limit
-        self.noise, self.own = max(robust_deviation(self.trial.match.distances), problem.noise.least), 0.0
-        self.trace: list[Step] = []
+        self.noise, self.own = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum), 0.0
+        self.trace: list[IterationRecord] = []
         self._at: LocalModel | None = None
 
     @property
     def _first_limit(self) -> float:
         return self.options.max_step * self.problem.observed.body.size
 
-    def run(self) -> Found:
+    def run(self) -> SolverResult:
         options = self.options
         ended = [self._descend(loss, options.handed_on) for loss in options.losses[:-1]]
         outcome = self._descend(options.losses[-1], options.settled)
-        if outcome in (Outcome.NO_DESCENT, Outcome.MOST_ITERATIONS, Outcome.OUT_OF_TIME) and self._has_enough():
+        if outcome in (Outcome.NO_DESCENT, Outcome.MAXIMUM_ITERATIONS, Outcome.OUT_OF_TIME) and self._has_enough():
             outcome = Outcome.CONVERGED
         if Outcome.OUT_OF_TIME in ended:  # far off, the last loss takes all points for outliers, and is content
             outcome = Outcome.OUT_OF_TIME
         local = self._local(self.options.losses[-1])
-        return Found.at(local, outcome, self.evaluations, tuple(self.trace))
+        return SolverResult.at(local, outcome, self.evaluations, tuple(self.trace))
 
     def _local(self, loss: Loss) -> LocalModel:
         """The model about the trial; what is known there already is not computed again."""
         at = self._at
-        if at is None or at.trial is not self.trial or at.loss is not loss:
-            jacobian = None if at is None or at.trial is not self.trial else at.jacobian
-            at = LocalModel(self.problem, self.trial, loss, self.noise, self.options.graduation, jacobian, self.own)
+        if at is None or at.evaluation is not self.evaluation or at.loss is not loss:
+            jacobian = None if at is None or at.evaluation is not self.evaluation else at.jacobian
+            at = LocalModel(
+                self.problem, self.evaluation, loss, self.noise, self.options.graduation, jacobian, self.own
+            )
             self._at, self.noise, self.own = at, at.noise, at.own
         return at
 
@@ -226,7 +230,7 @@ class _Search:
                 return refused
             if is_handed_on and local.was_whole and abs(self.trace[-1].gain - 1.0) < _KEPT:
                 return Outcome.CONVERGED
-        return Outcome.MOST_ITERATIONS
+        return Outcome.MAXIMUM_ITERATIONS
 
     def _has_enough(self) -> bool:
         local, enough = self._local(self.options.losses[-1]), self.options.enough
@@ -234,49 +238,51 @@ class _Search:
 
     def _is_closest(self, local: LocalModel, settled: float) -> bool:
         """Search the closest points anew; True where that moves the minimum no further than the search goes."""
-        before = self.trial.match.distances
-        again = self.problem.again(self.trial, self.options.trusted * robust_deviation(before))
+        before = self.evaluation.match.distances
+        again = self.problem.again(self.evaluation, self.options.trusted * robust_deviation(before))
         if np.abs(again.match.distances - before).max() >= _UNCHANGED * self.noise:
-            self.trial = again
+            self.evaluation = again
         return local.length_for(again) < settled
 
     def _lies_closer(self, local: LocalModel, loss: Loss) -> bool:
         """Search the closest points anew where no step helps; True where a point that had walked astray lies closer."""
-        again = self.problem.again(self.trial)
+        again = self.problem.again(self.evaluation)
         if local.value - local.objective(again, loss) <= _NEARER * local.value:
             return False
-        self.trial = again
+        self.evaluation = again
         return True
 
     def _step(self, local: LocalModel, loss: Loss) -> Outcome | None:
         """Take the best step within the limit; None when one was taken."""
         unsolved = False
-        while self.limit > self.options.least_step:
+        while self.limit > self.options.minimum_step:
             change = local.step(self.limit)
             largest = local.largest_movement(change)
             try:
                 self.evaluations += 1
-                trial = self.problem.trial(self.trial.coefficients + change, self.trial)
-                value = local.objective(trial, loss)
+                evaluation = self.problem.evaluation(self.evaluation.coefficients + change, self.evaluation)
+                value = local.objective(evaluation, loss)
                 gain = (local.value - value) / local.decrease(change)
             except NotConverged:
                 unsolved, gain, value = True, -1.0, np.inf
             self.limit = _next_limit(self.limit, largest, gain)
             if gain > 0.0:
-                self.trial = trial
+                self.evaluation = evaluation
                 self.trace.append(
-                    Step(trial.match.rms, value, local.noise, local.scales.force, largest, local.length, gain)
+                    IterationRecord(
+                        evaluation.match.rms, value, local.noise, local.scales.force, largest, local.length, gain
+                    )
                 )
                 return None
         self.limit = self._first_limit
         return Outcome.REFUSED if unsolved else Outcome.NO_DESCENT
 
 
-def _begun(problem: Problem, start: Floats, near: Trial | None) -> Trial:
+def _begun(problem: Problem, start: Floats, near: Evaluation | None) -> Evaluation:
     """The trial at the start: the one given, where it is of this cloud and has just these coefficients."""
     if near is None or near.cloud is not problem.cloud:
-        return problem.trial(start, near, anew=True)
-    return near if near.coefficients is start else problem.trial(start, near)
+        return problem.evaluation(start, near, anew=True)
+    return near if near.coefficients is start else problem.evaluation(start, near)
 
 
 def _next_limit(limit: float, taken: float, gain: float) -> float:
@@ -292,7 +298,7 @@ class LocalModel:
 
     Args:
         problem: what is registered.
-        trial: where.
+        evaluation: where.
         loss: of the points.
         noise: their scale so far, metres, for the weights that the scales are found with.
         graduation: the noise is taken as at least this part of what the linear model promises to change.
@@ -303,55 +309,59 @@ class LocalModel:
     def __init__(
         self,
         problem: Problem,
-        trial: Trial,
+        evaluation: Evaluation,
         loss: Loss,
         noise: float,
         graduation: float = 0.0,
         jacobian: Floats | None = None,
         own: float | None = None,
     ) -> None:
-        self.problem, self.trial, self.loss = problem, trial, loss
+        self.problem, self.evaluation, self.loss = problem, evaluation, loss
         self.own = noise if own is None else own
         self.was_whole = True
-        left_out = problem.left_out(trial)
-        self.jacobian = problem.jacobian(trial) if jacobian is None else jacobian
+        left_out = problem.left_out(evaluation)
+        self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
         self.scales, self.is_graduated = self._found_scales(loss, noise, left_out, graduation)
         self.noise = self.scales.noise
         self.deviations = np.hypot(self.noise, left_out)
-        residuals = problem.residuals(trial, self.own)
+        residuals = problem.residuals(evaluation, self.own)
         self.weights = loss.weight(residuals / self.deviations)
         self.precision = np.ones(problem.size)
         self.precision[problem.force_part] = 1.0 / self.scales.force**2
         trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
         self.information = trusted.T @ trusted
-        off, leaning = problem.mark_residuals(trial), problem.normal_residuals(trial)
-        self.mark_information, by_marks = _told(off, marks.LOSS, lambda: problem.mark_jacobian(trial))
-        self.normal_information, by_normals = _told(leaning, loss, lambda: problem.normal_jacobian(trial))
-        self._beside = by_marks + by_normals
-        self._hessian = self.information + self.mark_information + self.normal_information + np.diag(self.precision)
+        off, leaning = problem.landmark_residuals(evaluation), problem.normal_residuals(evaluation)
+        self.landmark_information, by_landmarks = _told(
+            off, landmarks.LOSS, lambda: problem.landmark_jacobian(evaluation)
+        )
+        self.normal_information, by_normals = _told(leaning, loss, lambda: problem.normal_jacobian(evaluation))
+        self._beside = by_landmarks + by_normals
+        self._hessian = self.information + self.landmark_information + self.normal_information + np.diag(self.precision)
         self.gradient = self._gradient(residuals, self.weights)
-        self.value = self.objective(trial, loss)
+        self.value = self.objective(evaluation, loss)
 
     def _gradient(self, residuals: Floats, weights: Floats) -> Floats:
         by_distances = weights * residuals / self.deviations**2
-        return by_distances @ self.jacobian + self.precision * self.trial.coefficients + self._beside
+        return by_distances @ self.jacobian + self.precision * self.evaluation.coefficients + self._beside
 
-    def _found_scales(self, loss: Loss, noise: float, left_out: Floats, graduation: float) -> tuple[Scales, bool]:
+    def _found_scales(
+        self, loss: Loss, noise: float, left_out: Floats, graduation: float
+    ) -> tuple[Hyperparameters, bool]:
         """Scales, and whether the noise is held above what the linear model alone would believe: the points' own."""
         problem, part = self.problem, self.problem.force_part
-        beside = self.jacobian[:, part.stop :], self.trial.coefficients[part.stop :]
-        coefficients, residuals = self.trial.coefficients[part], problem.residuals(self.trial, self.own)
+        beside = self.jacobian[:, part.stop :], self.evaluation.coefficients[part.stop :]
+        coefficients, residuals = self.evaluation.coefficients[part], problem.residuals(self.evaluation, self.own)
         deviations = np.hypot(noise, left_out)
         weights = loss.weight(residuals / deviations)
         shares = (noise / deviations) ** 2
         jacobian = self.jacobian[:, part]
         local = linearised(jacobian, residuals, weights, coefficients, loss.consistency, noise, beside, shares)
-        scales = find_scales(local, problem.noise, problem.forces.scale)
+        scales = estimate_hyperparameters(local, problem.noise, problem.forces.scale)
         self.own = scales.noise
-        least = graduation * local.promised(scales, coefficients)
-        if least <= scales.noise:
+        minimum = graduation * local.promised(scales, coefficients)
+        if minimum <= scales.noise:
             return scales, False
-        return find_scales(local, problem.noise.at_least(least), problem.forces.scale), True
+        return estimate_hyperparameters(local, problem.noise.with_minimum(minimum), problem.forces.scale), True
 
     @cached_property
     def _scaled_hessian(self) -> Floats:
@@ -385,13 +395,13 @@ class LocalModel:
         """The whole step."""
         return self._whole_for(self.gradient)
 
-    def objective(self, trial: Trial, loss: Loss) -> float:
+    def objective(self, evaluation: Evaluation, loss: Loss) -> float:
         """Robust distances and prior at these scales."""
-        prior = 0.5 * float(self.precision @ trial.coefficients**2)
-        scaled = self.problem.residuals(trial, self.own) / self.deviations
-        off = self.problem.mark_residuals(trial)
-        leaning = self.problem.normal_residuals(trial, self.trial.match)
-        beside = float(marks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
+        prior = 0.5 * float(self.precision @ evaluation.coefficients**2)
+        scaled = self.problem.residuals(evaluation, self.own) / self.deviations
+        off = self.problem.landmark_residuals(evaluation)
+        leaning = self.problem.normal_residuals(evaluation, self.evaluation.match)
+        beside = float(landmarks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
         return float(loss.value(scaled).sum()) + beside + prior
 
     @property
@@ -399,9 +409,9 @@ class LocalModel:
         """Length of the whole step in posterior deviations a coefficient."""
         return _length(self._whole, self.gradient)
 
-    def length_for(self, trial: Trial) -> float:
+    def length_for(self, evaluation: Evaluation) -> float:
         """The same at a trial of the same coefficients with other closest points, with these derivatives."""
-        residuals = self.problem.residuals(trial, self.own)
+        residuals = self.problem.residuals(evaluation, self.own)
         gradient = self._gradient(residuals, self.loss.weight(residuals / self.deviations))
         return _length(self._whole_for(gradient), gradient)
 
@@ -426,18 +436,18 @@ class LocalModel:
 
     def largest_movement(self, change: Floats) -> float:
         """Largest predicted movement of an observed node, metres."""
-        return float(self.problem.moved(self.trial, change).max())
+        return float(self.problem.moved(self.evaluation, change).max())
 
-    def posterior(self, alike: float = 1.0) -> Posterior:
+    def posterior(self, inflation_factor: float = 1.0) -> Posterior:
         """Laplace's approximation at the trial.
 
         Args:
-            alike: so many points tell what one would that errs by itself.
+            inflation_factor: so many points tell what one would that errs by itself.
         """
         count = self.problem.forces.size
-        told = (self.information + self.normal_information) / alike + self.mark_information
+        told = (self.information + self.normal_information) / inflation_factor + self.landmark_information
         noise = self.problem.noise_part
-        return posterior(told, self.precision, self.trial.coefficients, self.scales, count, noise)
+        return posterior(told, self.precision, self.evaluation.coefficients, self.scales, count, noise)
 
     def correlated(self, worth: float) -> tuple[float, float] | None:
         """Size and length of the noise that neighbours share, metres; None where the cloud does without.
@@ -447,13 +457,13 @@ class LocalModel:
         """
         problem = self.problem
         weights = np.clip(self.weights, 0.0, 1.0)
-        linear = problem.linear(self.trial, self.jacobian, self.noise, weights)
+        linear = problem.linear(self.evaluation, self.jacobian, self.noise, weights)
         return find_correlated(linear, problem.noise, problem.forces.scale, worth)
 
-    def alike(self) -> float:
-        """How many points tell what one would that errs by itself, as the residuals here have it; see `inflation`."""
-        scaled = self.problem.residuals(self.trial, self.own) / self.deviations
-        return inflation(self.problem.observed.feet(self.trial.match), scaled, self.weights)
+    def inflation_factor(self) -> float:
+        """How many correlated residuals count as one independent residual; see `variance_inflation`."""
+        scaled = self.problem.residuals(self.evaluation, self.own) / self.deviations
+        return variance_inflation(self.problem.observed.closest_points(self.evaluation.match), scaled, self.weights)
 
 
 def _told(off: Floats, loss: Loss, jacobian: Callable[[], Floats]) -> tuple[Floats | float, Floats | float]:

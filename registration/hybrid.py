@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from softtwin.reference.data.outcome import NotConverged
 
-from .marks import Marks
+from .landmarks import LandmarkPairs
 from .registrar import Registrar
 from .residuals import SurfaceDistance
 from .result import Registration, badness
@@ -49,9 +49,9 @@ class HybridRegistrar:
         """
         return HybridRegistrar(self.fast.limited(until), self.exact.limited(until))
 
-    def marked(self, marks: Marks | None) -> HybridRegistrar:
-        """The same with landmarks that pull beside the cloud, or without; see `Registrar.marked`."""
-        return HybridRegistrar(self.fast.marked(marks), self.exact.marked(marks))
+    def with_landmarks(self, landmarks: LandmarkPairs | None) -> HybridRegistrar:
+        """The same with landmarks that pull beside the cloud, or without; see `Registrar.with_landmarks`."""
+        return HybridRegistrar(self.fast.with_landmarks(landmarks), self.exact.with_landmarks(landmarks))
 
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud; see `Registrar.register`.

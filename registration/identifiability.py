@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .conditions import Conditions
+from .parameter_blocks import ParameterBlocks
 
 Floats = NDArray[np.float64]
 _ALONE = 0.9  # of an unknown's variance beforehand lies in what is not told: it is one by itself
 _NAMED = 0.3  # of the largest share: who has less is not what a combination is about
 
 
-def untold(
-    conditions: Conditions, names: Sequence[str], covariance: Floats, told: float
+def uninformed(
+    parameter_blocks: ParameterBlocks, names: Sequence[str], covariance: Floats, variance_reduction: float
 ) -> tuple[list[str], list[str]]:
     """Unknowns that a cloud does not tell, and combinations of others that it does not tell either.
 
@@ -24,23 +24,23 @@ def untold(
     covariance, since beforehand it is one.
 
     Args:
-        conditions: the unknowns.
+        parameter_blocks: the unknowns.
         names: one for each coefficient.
         covariance: of the coefficients after the cloud, (count, count).
-        told: least part of a direction's variance that a cloud must take away.
+        variance_reduction: least part of a direction's variance that a cloud must take away.
     """
     if not np.isfinite(covariance).all():
         return [], []
     values, vectors = np.linalg.eigh(covariance)
-    hidden = vectors[:, values > 1.0 - told]
+    hidden = vectors[:, values > 1.0 - variance_reduction]
     is_alone = (hidden**2).sum(axis=1) >= _ALONE
     rest = np.flatnonzero(~is_alone)
     values, vectors = np.linalg.eigh(covariance[np.ix_(rest, rest)])
     alone, combined = [names[place] for place in np.flatnonzero(is_alone)], list[str]()
-    for vector in vectors[:, values > 1.0 - told].T:
+    for vector in vectors[:, values > 1.0 - variance_reduction].T:
         direction = np.zeros(len(covariance))
         direction[rest] = vector
-        grown, shrunk = _sides(names, conditions.shares(direction))
+        grown, shrunk = _sides(names, parameter_blocks.shares(direction))
         (combined if len(grown) + len(shrunk) > 1 else alone).append(_in_words(grown, shrunk))
     return alone, combined
 

@@ -11,12 +11,12 @@ from scipy.optimize import minimize
 
 from softtwin.reference.data.outcome import NotConverged
 
-from . import marks
-from .gauss_newton import Found, LocalModel, Step
+from . import landmarks
+from .gauss_newton import IterationRecord, LocalModel, SolverResult
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .penalties import Penalty
-from .problem import Problem, Trial
+from .problem import Evaluation, Problem
 
 Floats = NDArray[np.float64]
 _WALL = 10.0  # times the objective: what a coefficient costs at which the model finds no state
@@ -71,7 +71,7 @@ class LBFGS:
         """The same with one short run: to judge a start."""
         return replace(self, losses=self.losses[:1], max_iterations=1)
 
-    def solve(self, problem: Problem, start: Floats, near: Trial | None = None) -> Found:
+    def solve(self, problem: Problem, start: Floats, near: Evaluation | None = None) -> SolverResult:
         """The coefficients that minimise the robust distance plus the prior.
 
         Args:
@@ -90,82 +90,84 @@ class _TimeIsOver(Exception):  # noqa: N818 - no error
 
 
 class _Run:
-    def __init__(self, options: LBFGS, problem: Problem, start: Floats, near: Trial | None) -> None:
+    def __init__(self, options: LBFGS, problem: Problem, start: Floats, near: Evaluation | None) -> None:
         self.options, self.problem = options, problem
-        self.trial = self.best = problem.trial(start, near, anew=True)
-        self.evaluations, self.trace = 1, list[Step]()
+        self.evaluation = self.best = problem.evaluation(start, near, anew=True)
+        self.evaluations, self.trace = 1, list[IterationRecord]()
         penalty = options.penalty
         self.cost = None if penalty is None else penalty.of(problem.observed.body, problem.forces)
 
-    def found(self) -> Found:
-        noise = max(robust_deviation(self.trial.match.distances), self.problem.noise.least)
+    def found(self) -> SolverResult:
+        noise = max(robust_deviation(self.evaluation.match.distances), self.problem.noise.minimum)
         outcome = Outcome.CONVERGED
         for loss in self.options.losses:
-            local = LocalModel(self.problem, self.trial, loss, noise)
+            local = LocalModel(self.problem, self.evaluation, loss, noise)
             noise = local.noise
             outcome = self._descend(loss, local)
-        local = LocalModel(self.problem, self.trial, self.options.losses[-1], noise)
-        return Found.at(local, outcome, self.evaluations, tuple(self.trace))
+        local = LocalModel(self.problem, self.evaluation, self.options.losses[-1], noise)
+        return SolverResult.at(local, outcome, self.evaluations, tuple(self.trace))
 
     def _descend(self, loss: Loss, local: LocalModel) -> Outcome:
         """One run at fixed scales, in coefficients of unit prior variance."""
         problem, scales = self.problem, local.scales
         root = np.ones(problem.size)
         root[problem.force_part] = scales.force
-        least = np.inf
+        minimum = np.inf
         met_wall = False
 
         def evaluate(scaled: Floats) -> tuple[float, Floats]:
-            nonlocal least, met_wall
+            nonlocal minimum, met_wall
             if time.monotonic() >= self.options.until:
                 raise _TimeIsOver
             self.evaluations += 1
             try:
-                trial = problem.trial(root * scaled, self.trial, anew=True)
+                evaluation = problem.evaluation(root * scaled, self.evaluation, anew=True)
             except NotConverged:  # a wall that the line search steps back from
                 met_wall = True
-                return _WALL * max(least, 1.0), np.zeros_like(scaled)
-            value, gradient = _objective(problem, trial, loss, local)
+                return _WALL * max(minimum, 1.0), np.zeros_like(scaled)
+            value, gradient = _objective(problem, evaluation, loss, local)
             held = scaled.copy()  # what the Gaussian priors pull back
             if self.cost is not None:
                 part = problem.force_part
                 held[part] = 0.0
-                paid, slope = self.cost(trial.coefficients[part])
+                paid, slope = self.cost(evaluation.coefficients[part])
                 value, gradient[part] = value + paid, gradient[part] + slope
             value += 0.5 * float(held @ held)
-            if value < least:
-                least, self.best = value, trial
+            if value < minimum:
+                minimum, self.best = value, evaluation
             return value, root * gradient + held
 
         limits = {"maxiter": self.options.max_iterations, "ftol": self.options.tolerance, "maxcor": self.options.memory}
         try:
-            done = minimize(evaluate, self.trial.coefficients / root, jac=True, method="L-BFGS-B", options=limits)
+            done = minimize(evaluate, self.evaluation.coefficients / root, jac=True, method="L-BFGS-B", options=limits)
         except _TimeIsOver:
             done = None
-        moved = float(problem.moved(self.trial, self.best.coefficients - self.trial.coefficients).max())
-        self.trial = self.best
+        moved = float(problem.moved(self.evaluation, self.best.coefficients - self.evaluation.coefficients).max())
+        self.evaluation = self.best
         self.trace.append(
-            Step(self.trial.match.rms, least, scales.noise, scales.force, moved, float("nan"), float("nan"))
+            IterationRecord(
+                self.evaluation.match.rms, minimum, scales.noise, scales.force, moved, float("nan"), float("nan")
+            )
         )
         if done is None:
             return Outcome.OUT_OF_TIME
         if done.success:
             return Outcome.CONVERGED
         if done.status == 1:
-            return Outcome.MOST_ITERATIONS
+            return Outcome.MAXIMUM_ITERATIONS
         return Outcome.REFUSED if met_wall else Outcome.NO_DESCENT
 
 
-def _objective(problem: Problem, trial: Trial, loss: Loss, local: LocalModel) -> tuple[float, Floats]:
+def _objective(problem: Problem, evaluation: Evaluation, loss: Loss, local: LocalModel) -> tuple[float, Floats]:
     """Robust distances and their gradient by the coefficients, (k,), at the scales of a model."""
-    scaled = problem.residuals(trial, local.own) / local.deviations
+    scaled = problem.residuals(evaluation, local.own) / local.deviations
     slope = loss.weight(scaled) * scaled / local.deviations
-    value, gradient = float(loss.value(scaled).sum()), problem.pulled(trial, slope)
-    off, held = problem.mark_residuals(trial), local.trial.match
-    leaning = problem.normal_residuals(trial, held)
-    value += float(marks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
+    value, gradient = float(loss.value(scaled).sum()), problem.vjp(evaluation, slope)
+    off, held = problem.landmark_residuals(evaluation), local.evaluation.match
+    leaning = problem.normal_residuals(evaluation, held)
+    value += float(landmarks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
     if len(off):
-        gradient = gradient + problem.marks_pulled(trial, marks.LOSS.weight(off) * off)
+        gradient = gradient + problem.landmarks_vjp(evaluation, landmarks.LOSS.weight(off) * off)
     if len(leaning):
-        gradient = gradient + problem.normals_pulled(trial, loss.weight(leaning) * leaning, held)
+        gradient = gradient + problem.normals_vjp(evaluation, loss.weight(leaning) * leaning, held)
     return value, gradient

@@ -9,13 +9,13 @@ import numpy as np
 from softtwin.meshes.body import Body
 from softtwin.meshes.metrics import edge_lengths
 
-from .evidence import Scale
 from .forward import ForwardModel
 from .gauss_newton import GaussNewton
+from .hyperparameters import LogNormalPrior
 from .lbfgs import LBFGS
+from .priors import LikelihoodInformed
 from .problem import NORMAL_DEVIATION
 from .residuals import Distance
-from .unknowns import Informed
 
 _SPREAD_ANYWHERE = (
     0.7  # of the logarithm of a nodal force, where a cloud tells the size of forces of which most are none
@@ -23,11 +23,11 @@ _SPREAD_ANYWHERE = (
 _MANY = 10_000  # points: of no cloud that is left after thinning are there more
 _CLEAR, _LOUD = 2.0, 1.5  # times the least noise, times the model's error
 _CLOSE = 0.01  # reach of a surrogate's forces whose zone is unknown: with more, their doubt is larger than their error
-NOISE = Scale(5e-4, 1.5, least=1e-4)  # metres; no camera is better than the least
+NOISE = LogNormalPrior(5e-4, 1.5, minimum=1e-4)  # metres; no camera is better than the least
 
 
 @dataclass(frozen=True)
-class Gathering:
+class SparseLocalisation:
     """How a cold start finds where forces act: they are expected again where a round before has found some.
 
     Args:
@@ -39,16 +39,16 @@ class Gathering:
 
     rounds: int = 2
     reach: float = 0.035
-    informed: Informed = field(default_factory=Informed)
+    informed: LikelihoodInformed = field(default_factory=LikelihoodInformed)
     points: int = 300
 
     def __post_init__(self) -> None:
         if self.points < 1:
-            raise ValueError(f"Gathering.points: expected at least 1, got {self.points}.")
+            raise ValueError(f"SparseLocalisation.points: expected at least 1, got {self.points}.")
 
 
 @dataclass(frozen=True)
-class Belief:
+class ForceHyperprior:
     """When the size of the forces is left to the cloud, whatever was expected of it.
 
     Args:
@@ -69,19 +69,19 @@ class RegistrationOptions:
     Args:
         noise: what is believed of the standard deviation of a point's distance, metres; found from the cloud.
         solver: how the objective is minimised.
-        most_points: larger clouds are thinned to so many points.
-        gathering: how a cold start finds where forces act.
-        belief: when the size of the forces is left to the cloud.
+        maximum_points: larger clouds are thinned to so many points.
+        localisation: how a cold start finds where forces act.
+        hyperprior: when the size of the forces is left to the cloud.
         distance: of points to the surface, or to the planes of its triangles; see `SurfaceDistance`.
         normal_deviation: standard deviation of a measured normal across itself, radians.
         correlated: look for noise that neighbouring points share; see `correlated.find_correlated`.
     """
 
-    noise: Scale = NOISE
+    noise: LogNormalPrior = NOISE
     solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
-    most_points: int = 1000
-    gathering: Gathering = field(default_factory=Gathering)
-    belief: Belief = field(default_factory=Belief)
+    maximum_points: int = 1000
+    localisation: SparseLocalisation = field(default_factory=SparseLocalisation)
+    hyperprior: ForceHyperprior = field(default_factory=ForceHyperprior)
     distance: Distance = "surface"
     normal_deviation: float = NORMAL_DEVIATION
     correlated: bool = True
@@ -93,8 +93,8 @@ class RegistrationOptions:
             raise ValueError(
                 f"RegistrationOptions.normal_deviation: expected a positive angle, got {self.normal_deviation}."
             )
-        if self.most_points < 1:
-            raise ValueError(f"RegistrationOptions.most_points: expected at least 1, got {self.most_points}.")
+        if self.maximum_points < 1:
+            raise ValueError(f"RegistrationOptions.maximum_points: expected at least 1, got {self.maximum_points}.")
 
 
 def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> RegistrationOptions:
@@ -110,14 +110,16 @@ def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> 
         has_zone: the nodes that may carry force are those that a tool can touch.
         has_pose: the pose is unknown.
     """
-    clear, loud = _CLEAR * NOISE.least, _LOUD * model.error
+    clear, loud = _CLEAR * NOISE.minimum, _LOUD * model.error
     if model.error == 0.0:
-        gathering = Gathering(rounds=0 if has_zone else Gathering.rounds, points=_MANY)
-        return RegistrationOptions(gathering=gathering, belief=Belief(clear))
+        localisation = SparseLocalisation(rounds=0 if has_zone else SparseLocalisation.rounds, points=_MANY)
+        return RegistrationOptions(localisation=localisation, hyperprior=ForceHyperprior(clear))
     if has_zone:
-        belief = Belief(clear if has_pose else 0.0, loud)
-        return RegistrationOptions(gathering=Gathering(rounds=0, points=_MANY), belief=belief)
-    return RegistrationOptions(gathering=Gathering(reach=_CLOSE), belief=Belief(loud=loud, spread=_SPREAD_ANYWHERE))
+        hyperprior = ForceHyperprior(clear if has_pose else 0.0, loud)
+        return RegistrationOptions(localisation=SparseLocalisation(rounds=0, points=_MANY), hyperprior=hyperprior)
+    return RegistrationOptions(
+        localisation=SparseLocalisation(reach=_CLOSE), hyperprior=ForceHyperprior(loud=loud, spread=_SPREAD_ANYWHERE)
+    )
 
 
 def expected_force(body: Body, young_modulus: float) -> float:

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
 
-from .unknowns import Forces
+from .priors import NodalForces
 
 Floats = NDArray[np.float64]
 Cost = Callable[[Floats], tuple[float, Floats]]
@@ -22,7 +22,7 @@ _ROUND = 0.02  # of the expected force: where the root of a square is rounded of
 class Penalty(Protocol):
     """Says what forces cost on a body."""
 
-    def of(self, body: Body, forces: Forces) -> Cost:
+    def of(self, body: Body, forces: NodalForces) -> Cost:
         """The cost of coefficients of the forces, (k,), and its gradient, (k,), in units of the distances' cost.
 
         Args:
@@ -49,17 +49,17 @@ class Amplitude:
     def __post_init__(self) -> None:
         _check(self, self.alpha)
 
-    def of(self, body: Body, forces: Forces) -> Cost:
+    def of(self, body: Body, forces: NodalForces) -> Cost:
         """See `Penalty.of`."""
         patterns, expected = forces.patterns, forces.scale.median
-        least = _ROUND * expected
+        minimum = _ROUND * expected
 
         def cost(coefficients: Floats) -> tuple[float, Floats]:
             nodal = (patterns @ coefficients).reshape(-1, 3)
-            sizes = np.sqrt((nodal**2).sum(axis=1) + least**2)
+            sizes = np.sqrt((nodal**2).sum(axis=1) + minimum**2)
             slope = (nodal / sizes[:, None]).ravel() @ patterns
             part = 0.5 * self.alpha / expected
-            return part * float((sizes - least).sum()), part * slope
+            return part * float((sizes - minimum).sum()), part * slope
 
         return cost
 
@@ -80,7 +80,7 @@ class Divergence:
     def __post_init__(self) -> None:
         _check(self, self.alpha)
 
-    def of(self, body: Body, forces: Forces) -> Cost:
+    def of(self, body: Body, forces: NodalForces) -> Cost:
         """See `Penalty.of`; a body whose surface has vertices of its own (a sparse grid with a skin) has none."""
         if body.skin is not None:
             raise ValueError("Divergence.body: expected a body whose nodes are its surface's, got one with a skin.")

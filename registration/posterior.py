@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .evidence import Scales
+from .hyperparameters import Hyperparameters
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ class Posterior:
 
     mean: Floats
     covariance: Floats
-    scales: Scales
+    scales: Hyperparameters
     informed: float
 
     def net_force_covariance(self, net: Floats, left_out: Floats) -> Floats:
@@ -39,7 +39,7 @@ class Posterior:
 
 
 def posterior(
-    information: Floats, precision: Floats, mean: Floats, scales: Scales, forces: int, apart: slice = slice(0)
+    information: Floats, precision: Floats, mean: Floats, scales: Hyperparameters, forces: int, apart: slice = slice(0)
 ) -> Posterior:
     """The posterior for the information of the points, (k, k), and the prior's precision, (k,).
 

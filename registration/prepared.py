@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .conditions import Conditions
 from .forward import ForwardModel, ReducedModel, reduce_model
+from .parameter_blocks import ParameterBlocks
+from .priors import LikelihoodInformed, NodalForces, likelihood_informed
 from .residuals import SurfaceDistance
 from .uncertainty import unseen_response
-from .unknowns import Forces, Informed, told
 
 Floats = NDArray[np.float64]
 
@@ -26,19 +26,23 @@ class Prepared:
         model: from their coefficients to the observed nodes.
     """
 
-    forces: Forces
+    forces: NodalForces
     model: ReducedModel
 
     @classmethod
     def of(
-        cls, model: ForwardModel, observed: SurfaceDistance, forces: Forces, conditions: Conditions | None = None
+        cls,
+        model: ForwardModel,
+        observed: SurfaceDistance,
+        forces: NodalForces,
+        parameter_blocks: ParameterBlocks | None = None,
     ) -> Prepared:
         """What can be multiplied before a cloud comes."""
-        return cls(forces, reduce_model(model, observed.nodes, forces.basis, conditions))
+        return cls(forces, reduce_model(model, observed.nodes, forces.basis, parameter_blocks))
 
-    def informed(self, observed: SurfaceDistance, rule: Informed) -> Prepared:
-        """The directions that a cloud can tell: see `unknowns.told`."""
-        kept = told(self.model, observed, rule)
+    def informed(self, observed: SurfaceDistance, rule: LikelihoodInformed) -> Prepared:
+        """The directions that a cloud can tell: see `unknowns.likelihood_informed`."""
+        kept = likelihood_informed(self.model, observed, rule)
         return Prepared(self.forces.combined(kept), self.model.combined(kept))
 
     def leading(self, count: int) -> Prepared:
@@ -50,7 +54,7 @@ class Prepared:
         """Displacements by the directions of force that were left out, for unit scale, (3n, r)."""
         return unseen_response(self.model, self.forces)
 
-    def believing(self, spread: float) -> Prepared:
+    def with_prior(self, spread: float) -> Prepared:
         """The same with another spread of the logarithm of the forces' size."""
         scale = replace(self.forces.scale, spread=spread)
         return replace(self, forces=replace(self.forces, scale=scale))

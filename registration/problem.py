@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from .cloud import Cloud
-from .conditions import Conditions
 from .correlated import CorrelatedNoise, Linear
-from .evidence import Scale
-from .forward import ConditionedModel, ConditionedState, ReducedModel, ReducedState
-from .marks import Marks
+from .forward import ParametrisedModel, ParametrisedState, ReducedModel, ReducedState
+from .hyperparameters import LogNormalPrior
+from .landmarks import LandmarkPairs
+from .parameter_blocks import ParameterBlocks
 from .pose import Pose
-from .residuals import Match, SurfaceDistance
-from .unknowns import Forces, ModelError, PosePrior
+from .priors import ModelError, NodalForces, PosePrior
+from .residuals import Correspondence, SurfaceDistance
 
 Floats = NDArray[np.float64]
 _COUNTED = 0.2  # weight: points with less are outliers
@@ -29,7 +29,7 @@ NORMAL_DEVIATION = float(np.deg2rad(10.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class Evaluation:
     """The problem at one set of coefficients.
 
     Args:
@@ -46,7 +46,7 @@ class Trial:
     positions: Floats
     pose: Pose | None
     cloud: Floats
-    match: Match
+    match: Correspondence
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,25 +61,25 @@ class Problem:
         cloud: points, (p, 3), metres.
         noise: what is believed of the standard deviation of a point's distance, metres.
         error: what the model may get wrong; None where it is not known in patterns.
-        conditions: unknowns beside the forces, which the model takes; None where there are none.
-        marks: landmarks that pull beside the cloud; None where there are none.
-        across: two unit vectors across each point's measured normal, in the cloud's coordinates, (p, 2, 3): how far the
+        parameter_blocks: unknowns beside the forces, which the model takes; None where there are none.
+        landmarks: landmarks that pull beside the cloud; None where there are none.
+        tangent_basis: two unit vectors across each point's measured normal, in the cloud's axes, (p, 2, 3): how far the
             surface leans towards them pulls, too; None for a cloud without normals.
-        leaning: standard deviation of that, radians.
+        normal_deviation: standard deviation of that, radians.
         correlated: noise that neighbouring points share, as unknowns; None where each point errs by itself.
     """
 
     model: ReducedModel
     observed: SurfaceDistance
-    forces: Forces
+    forces: NodalForces
     pose: PosePrior | None
     cloud: Floats
-    noise: Scale
+    noise: LogNormalPrior
     error: ModelError | None = None
-    conditions: Conditions | None = None
-    marks: Marks | None = None
-    across: Floats | None = None
-    leaning: float = NORMAL_DEVIATION
+    parameter_blocks: ParameterBlocks | None = None
+    landmarks: LandmarkPairs | None = None
+    tangent_basis: Floats | None = None
+    normal_deviation: float = NORMAL_DEVIATION
     correlated: CorrelatedNoise | None = None
 
     @classmethod
@@ -90,7 +90,7 @@ class Problem:
             cloud: points with or without normals.
             given: all other arguments.
         """
-        return cls(cloud=cloud.points, across=cloud.across, **given)
+        return cls(cloud=cloud.points, tangent_basis=cloud.tangent_basis, **given)
 
     @property
     def size(self) -> int:
@@ -108,15 +108,15 @@ class Problem:
         return slice(self.forces.size, self.forces.size + (0 if self.pose is None else 6))
 
     @cached_property
-    def condition_part(self) -> slice:
+    def parameter_part(self) -> slice:
         """Where those of the conditions are."""
         begin = self.pose_part.stop
-        return slice(begin, begin + (0 if self.conditions is None else self.conditions.count))
+        return slice(begin, begin + (0 if self.parameter_blocks is None else self.parameter_blocks.count))
 
     @cached_property
     def noise_part(self) -> slice:
         """Where those of the correlated noise are."""
-        begin = self.condition_part.stop
+        begin = self.parameter_part.stop
         return slice(begin, begin + (0 if self.correlated is None else self.correlated.count))
 
     @cached_property
@@ -130,20 +130,20 @@ class Problem:
         assert self.correlated is not None
         return self.correlated.near(self.cloud)
 
-    def normals(self, trial: Trial) -> Floats:
+    def normals(self, evaluation: Evaluation) -> Floats:
         """Of the surface at the points, (p, 3), on the cloud's axes."""
-        directions = trial.match.directions
-        return directions if trial.pose is None else directions @ trial.pose.rotation.T
+        directions = evaluation.match.directions
+        return directions if evaluation.pose is None else directions @ evaluation.pose.rotation.T
 
-    def shared_noise(self, trial: Trial) -> Floats:
+    def shared_noise(self, evaluation: Evaluation) -> Floats:
         """The part of the distances that is taken for noise that neighbours share, (p,), metres."""
         if self.correlated is None:
             return np.zeros(len(self.cloud))
-        return self.correlated.shifts(trial.coefficients[self.noise_part], self._near, self.normals(trial))
+        return self.correlated.shifts(evaluation.coefficients[self.noise_part], self._near, self.normals(evaluation))
 
-    def _by_noise(self, trial: Trial) -> Floats | None:
+    def _by_noise(self, evaluation: Evaluation) -> Floats | None:
         """Derivative of the residuals by its coefficients, (p, q)."""
-        return None if self.correlated is None else -self.correlated.patterns(self._near, self.normals(trial))
+        return None if self.correlated is None else -self.correlated.patterns(self._near, self.normals(evaluation))
 
     def carried(self, coefficients: Floats, before: Problem) -> Floats:
         """Coefficients of another problem for a start of this one, (k,); what it did not have is zero.
@@ -153,7 +153,7 @@ class Problem:
             before: that problem, of the same kinds of forces, pose and conditions.
         """
         start = np.zeros(self.size)
-        start[: self.condition_part.stop] = coefficients[: before.condition_part.stop]
+        start[: self.parameter_part.stop] = coefficients[: before.parameter_part.stop]
         mine, other = self.correlated, before.correlated
         if mine is not None and other is not None and mine.centres is other.centres:
             start[self.noise_part] = coefficients[before.noise_part]
@@ -162,31 +162,31 @@ class Problem:
             start[self.error_part] = errors
         return start
 
-    def linear(self, trial: Trial, jacobian: Floats, noise: float, weights: Floats) -> Linear:
+    def linear(self, evaluation: Evaluation, jacobian: Floats, noise: float, weights: Floats) -> Linear:
         """The distances, linear in the unknowns about a trial, without correlated noise.
 
         Args:
-            trial: where.
+            evaluation: where.
             jacobian: derivative of the distances there, (p, k).
             noise: standard deviation of a point's distance, metres.
             weights: of the points, (p,); those with little are left out.
         """
-        kept, coefficients = weights > _COUNTED, trial.coefficients.copy()
+        kept, coefficients = weights > _COUNTED, evaluation.coefficients.copy()
         coefficients[self.noise_part] = 0.0
-        distances = self.residuals(trial, noise) + self.shared_noise(trial)
+        distances = self.residuals(evaluation, noise) + self.shared_noise(evaluation)
         columns = np.arange(self.size)
         others = np.setdiff1d(columns[self.force_part.stop :], columns[self.noise_part])
         return Linear(
             self.cloud[kept],
-            self.normals(trial)[kept],
+            self.normals(evaluation)[kept],
             (jacobian @ coefficients - distances)[kept],
             jacobian[kept][:, self.force_part],
             jacobian[kept][:, others],
-            self.left_out(trial)[kept],
+            self.left_out(evaluation)[kept],
             weights[kept],
         )
 
-    def trial(self, coefficients: Floats, near: Trial | None = None, *, anew: bool = False) -> Trial:
+    def evaluation(self, coefficients: Floats, near: Evaluation | None = None, *, anew: bool = False) -> Evaluation:
         """The problem at some coefficients.
 
         Args:
@@ -200,7 +200,7 @@ class Problem:
         from_match = None if near is None or anew else near.match
         return self._at(coefficients, near, lambda moved, cloud: self.observed.match(moved, cloud, from_match))
 
-    def begun(self, coefficients: Floats, near: Trial | None = None) -> Trial:
+    def begun(self, coefficients: Floats, near: Evaluation | None = None) -> Evaluation:
         """The same for another cloud than the trial's: closest points by the nearest vertices, good for a start.
 
         Args:
@@ -212,154 +212,167 @@ class Problem:
         """
         return self._at(coefficients, near, self.observed.match_nearby)
 
-    def _at(self, coefficients: Floats, near: Trial | None, matched: Callable[[Floats, Floats], Match]) -> Trial:
+    def _at(
+        self, coefficients: Floats, near: Evaluation | None, matched: Callable[[Floats, Floats], Correspondence]
+    ) -> Evaluation:
         state = self._state(coefficients, None if near is None else near.state)
         positions = state.positions
         if self.error is not None:
             positions = positions + self.error.observed_field(coefficients[self.error_part])
         pose = None if self.pose is None else self.pose.pose(coefficients[self.pose_part])
         cloud = self.cloud if pose is None else pose.inverse().apply(self.cloud)
-        return Trial(coefficients, state, positions, pose, cloud, matched(positions, cloud))
+        return Evaluation(coefficients, state, positions, pose, cloud, matched(positions, cloud))
 
     def _state(self, coefficients: Floats, near: ReducedState | None) -> ReducedState:
         forces = coefficients[self.force_part]
-        if self.conditions is None:
+        if self.parameter_blocks is None:
             return self.model.solve(forces, near)
-        conditioned = cast(ConditionedModel, self.model)
-        return conditioned.solve(forces, near, coefficients[self.condition_part])
+        conditioned = cast(ParametrisedModel, self.model)
+        return conditioned.solve(forces, near, coefficients[self.parameter_part])
 
-    def correction(self, trial: Trial) -> Floats:
+    def correction(self, evaluation: Evaluation) -> Floats:
         """What the model's error adds to the displacement of all nodes, (n, 3), metres."""
         if self.error is None:
             return np.zeros_like(self.observed.body.points)
-        return self.error.field(trial.coefficients[self.error_part])
+        return self.error.field(evaluation.coefficients[self.error_part])
 
-    def left_out(self, trial: Trial) -> Floats:
+    def left_out(self, evaluation: Evaluation) -> Floats:
         """Standard deviation of each distance by what the patterns of the model's error leave out, (p,), metres.
 
         Neighbours share it: many points tell no more of it than there are places where it is independent.
         """
         if self.error is None:
             return np.zeros(len(self.cloud))
-        alike = max(len(self.cloud) / self.error.discrepancy.places, 1.0)
-        return np.sqrt(alike) * self.observed.at_points(trial.match, self.error.rest)
+        inflation_factor = max(len(self.cloud) / self.error.discrepancy.places, 1.0)
+        return np.sqrt(inflation_factor) * self.observed.at_points(evaluation.match, self.error.rest)
 
-    def residuals(self, trial: Trial, noise: float) -> Floats:
+    def residuals(self, evaluation: Evaluation, noise: float) -> Floats:
         """Distances less what they are in the mean for points of some noise, and less shared noise, (p,), metres.
 
         Args:
-            trial: at some coefficients.
+            evaluation: at some coefficients.
             noise: standard deviation of each coordinate of a point, metres.
         """
-        expected = self.observed.expected(trial.match, noise)
-        return trial.match.distances - expected - self.shared_noise(trial)
+        expected = self.observed.expected(evaluation.match, noise)
+        return evaluation.match.distances - expected - self.shared_noise(evaluation)
 
-    def again(self, trial: Trial, beyond: float = 0.0) -> Trial:
+    def again(self, evaluation: Evaluation, beyond: float = 0.0) -> Evaluation:
         """The same trial with closest points searched anew.
 
         Args:
-            trial: at some coefficients.
+            evaluation: at some coefficients.
             beyond: only of points further than this from the surface, metres.
         """
-        return replace(trial, match=self.observed.match_beyond(trial.positions, trial.cloud, trial.match, beyond))
+        return replace(
+            evaluation,
+            match=self.observed.match_beyond(evaluation.positions, evaluation.cloud, evaluation.match, beyond),
+        )
 
-    def jacobian(self, trial: Trial) -> Floats:
+    def jacobian(self, evaluation: Evaluation) -> Floats:
         """Derivative of the residuals by the coefficients, (p, k), exact."""
-        rows = self.observed.rows(trial.match)
-        by_pose = self._by_pose(trial, trial.match.directions, trial.cloud)
-        return self._by_coefficients(trial, rows, by_pose, self._by_noise(trial))
+        rows = self.observed.rows(evaluation.match)
+        by_pose = self._by_pose(evaluation, evaluation.match.directions, evaluation.cloud)
+        return self._by_coefficients(evaluation, rows, by_pose, self._by_noise(evaluation))
 
-    def pulled(self, trial: Trial, cotangent: Floats) -> Floats:
+    def vjp(self, evaluation: Evaluation, cotangent: Floats) -> Floats:
         """Gradient by the coefficients, (k,), from the one by the residuals, (p,): J^T g with the adjoint."""
-        rows = self.observed.rows(trial.match)
-        by_pose = self._by_pose(trial, trial.match.directions, trial.cloud)
-        return self._pulled(trial, rows, by_pose, cotangent, self._by_noise(trial))
+        rows = self.observed.rows(evaluation.match)
+        by_pose = self._by_pose(evaluation, evaluation.match.directions, evaluation.cloud)
+        return self._pulled(evaluation, rows, by_pose, cotangent, self._by_noise(evaluation))
 
-    def mark_residuals(self, trial: Trial) -> Floats:
+    def landmark_residuals(self, evaluation: Evaluation) -> Floats:
         """Coordinates of the landmarks less where they were found, over their deviation, (3l,), body's axes."""
-        if self.marks is None:
+        if self.landmarks is None:
             return np.zeros(0)
-        off = self.observed.moved_feet(self.marks.feet, trial.positions) - self._found_marks(trial)
-        return (off / self.marks.deviation).ravel()
+        off = self.observed.moved_closest_points(
+            self.landmarks.closest_points, evaluation.positions
+        ) - self._found_marks(evaluation)
+        return (off / self.landmarks.deviation).ravel()
 
-    def mark_jacobian(self, trial: Trial) -> Floats:
+    def landmark_jacobian(self, evaluation: Evaluation) -> Floats:
         """Derivative of these by the coefficients, (3l, k), exact."""
-        if self.marks is None:
+        if self.landmarks is None:
             return np.zeros((0, self.size))
-        rows = self.marks.rows(self.observed) / self.marks.deviation
-        return self._by_coefficients(trial, rows, self._marks_by_pose(trial))
+        rows = self.landmarks.rows(self.observed) / self.landmarks.deviation
+        return self._by_coefficients(evaluation, rows, self._marks_by_pose(evaluation))
 
-    def marks_pulled(self, trial: Trial, cotangent: Floats) -> Floats:
+    def landmarks_vjp(self, evaluation: Evaluation, cotangent: Floats) -> Floats:
         """Gradient by the coefficients, (k,), from the one by the landmarks' residuals, (3l,), with the adjoint."""
-        if self.marks is None:
+        if self.landmarks is None:
             return np.zeros(self.size)
-        rows = self.marks.rows(self.observed) / self.marks.deviation
-        return self._pulled(trial, rows, self._marks_by_pose(trial), cotangent)
+        rows = self.landmarks.rows(self.observed) / self.landmarks.deviation
+        return self._pulled(evaluation, rows, self._marks_by_pose(evaluation), cotangent)
 
-    def normal_residuals(self, trial: Trial, held: Match | None = None) -> Floats:
+    def normal_residuals(self, evaluation: Evaluation, held: Correspondence | None = None) -> Floats:
         """How far the surface leans from the normals measured, over its deviation, (2p,): two directions a point.
 
         A normal counts up to its sign. A surface that is turned by an angle leans by its sine.
 
         Args:
-            trial: at some coefficients.
+            evaluation: at some coefficients.
             held: a match whose triangles are looked at; the trial's if not given. Where closest points go on to the
                 next triangle these residuals jump: who compares two trials holds them.
         """
-        if self.across is None:
+        if self.tangent_basis is None:
             return np.zeros(0)
-        facing = self.observed.facing(held or trial.match, trial.positions)
-        return np.einsum("pqi,pi->pq", self._across(trial), facing).ravel() / self.leaning
+        facing = self.observed.facing(held or evaluation.match, evaluation.positions)
+        return np.einsum("pqi,pi->pq", self._across(evaluation), facing).ravel() / self.normal_deviation
 
-    def normal_jacobian(self, trial: Trial) -> Floats:
+    def normal_jacobian(self, evaluation: Evaluation) -> Floats:
         """Derivative of these by the coefficients, (2p, k), exact for triangles that are held."""
-        if self.across is None:
+        if self.tangent_basis is None:
             return np.zeros((0, self.size))
-        match = trial.match
-        return self._by_coefficients(trial, self._normal_rows(trial, match), self._normals_by_pose(trial, match))
+        match = evaluation.match
+        return self._by_coefficients(
+            evaluation, self._normal_rows(evaluation, match), self._normals_by_pose(evaluation, match)
+        )
 
-    def normals_pulled(self, trial: Trial, cotangent: Floats, held: Match | None = None) -> Floats:
+    def normals_vjp(self, evaluation: Evaluation, cotangent: Floats, held: Correspondence | None = None) -> Floats:
         """Gradient by the coefficients, (k,), from the one by the normals' residuals, (2p,), with the adjoint."""
-        if self.across is None:
+        if self.tangent_basis is None:
             return np.zeros(self.size)
-        match = held or trial.match
-        return self._pulled(trial, self._normal_rows(trial, match), self._normals_by_pose(trial, match), cotangent)
+        match = held or evaluation.match
+        return self._pulled(
+            evaluation, self._normal_rows(evaluation, match), self._normals_by_pose(evaluation, match), cotangent
+        )
 
-    def _across(self, trial: Trial) -> Floats:
+    def _across(self, evaluation: Evaluation) -> Floats:
         """In the body's coordinates."""
-        assert self.across is not None
-        return self.across if trial.pose is None else self.across @ trial.pose.rotation
+        assert self.tangent_basis is not None
+        return self.tangent_basis if evaluation.pose is None else self.tangent_basis @ evaluation.pose.rotation
 
-    def _normal_rows(self, trial: Trial, match: Match) -> csr_array:
-        return self.observed.facing_rows(match, trial.positions, self._across(trial) / self.leaning)
+    def _normal_rows(self, evaluation: Evaluation, match: Correspondence) -> csr_array:
+        return self.observed.facing_rows(match, evaluation.positions, self._across(evaluation) / self.normal_deviation)
 
-    def _normals_by_pose(self, trial: Trial, match: Match) -> Floats | None:
+    def _normals_by_pose(self, evaluation: Evaluation, match: Correspondence) -> Floats | None:
         """A direction of the body turns with the pose, and is not shifted: a point's derivative less the origin's."""
-        facing = np.repeat(self.observed.facing(match, trial.positions), 2, axis=0)
-        along = (self._across(trial) / self.leaning).reshape(-1, 3)
-        turned = self._by_pose(trial, along, facing)
-        at_origin = self._by_pose(trial, along, np.zeros_like(facing))
+        facing = np.repeat(self.observed.facing(match, evaluation.positions), 2, axis=0)
+        along = (self._across(evaluation) / self.normal_deviation).reshape(-1, 3)
+        turned = self._by_pose(evaluation, along, facing)
+        at_origin = self._by_pose(evaluation, along, np.zeros_like(facing))
         return None if turned is None or at_origin is None else turned - at_origin
 
-    def _found_marks(self, trial: Trial) -> Floats:
+    def _found_marks(self, evaluation: Evaluation) -> Floats:
         """Where the landmarks were found, in the body's coordinates, (l, 3)."""
-        assert self.marks is not None
-        return self.marks.places if trial.pose is None else trial.pose.inverse().apply(self.marks.places)
+        assert self.landmarks is not None
+        return (
+            self.landmarks.places if evaluation.pose is None else evaluation.pose.inverse().apply(self.landmarks.places)
+        )
 
-    def _marks_by_pose(self, trial: Trial) -> Floats | None:
-        assert self.marks is not None
-        axes = np.tile(np.eye(3) / self.marks.deviation, (len(self.marks), 1))
-        return self._by_pose(trial, axes, np.repeat(self._found_marks(trial), 3, axis=0))
+    def _marks_by_pose(self, evaluation: Evaluation) -> Floats | None:
+        assert self.landmarks is not None
+        axes = np.tile(np.eye(3) / self.landmarks.deviation, (len(self.landmarks), 1))
+        return self._by_pose(evaluation, axes, np.repeat(self._found_marks(evaluation), 3, axis=0))
 
     def _by_coefficients(
-        self, trial: Trial, rows: csr_array, by_pose: Floats | None, by_noise: Floats | None = None
+        self, evaluation: Evaluation, rows: csr_array, by_pose: Floats | None, by_noise: Floats | None = None
     ) -> Floats:
         """Derivative of linear functions of the observed nodes' displacement, (q, k), for rows (q, 3m)."""
-        blocks = [trial.state.jacobian(rows)]
+        blocks = [evaluation.state.jacobian(rows)]
         if by_pose is not None:
             blocks.append(by_pose)
-        if self.conditions is not None:
-            blocks.append(cast(ConditionedState, trial.state).rows_by_conditions(rows))
+        if self.parameter_blocks is not None:
+            blocks.append(cast(ParametrisedState, evaluation.state).rows_by_parameters(rows))
         if self.correlated is not None:
             blocks.append(np.zeros((rows.shape[0], self.correlated.count)) if by_noise is None else by_noise)
         if self.error is not None:
@@ -367,74 +380,81 @@ class Problem:
         return np.hstack(blocks)
 
     def _pulled(
-        self, trial: Trial, rows: csr_array, by_pose: Floats | None, cotangent: Floats, by_noise: Floats | None = None
+        self,
+        evaluation: Evaluation,
+        rows: csr_array,
+        by_pose: Floats | None,
+        cotangent: Floats,
+        by_noise: Floats | None = None,
     ) -> Floats:
         """The same, transposed and applied, (k,)."""
         by_nodes = (rows.T @ cotangent).reshape(-1, 3)
         full = np.zeros_like(self.observed.body.points)
         full[self.observed.nodes] = by_nodes
-        blocks = [self.growth(trial)[0] * (trial.state.full.pull(full).ravel() @ self.forces.basis)]
+        blocks = [self.stiffness_scaling(evaluation)[0] * (evaluation.state.full.vjp(full).ravel() @ self.forces.basis)]
         if by_pose is not None:
             blocks.append(cotangent @ by_pose)
-        if self.conditions is not None:
-            blocks.append(full.ravel() @ cast(ConditionedState, trial.state).by_conditions())
+        if self.parameter_blocks is not None:
+            blocks.append(full.ravel() @ cast(ParametrisedState, evaluation.state).by_parameters())
         if self.correlated is not None:
             blocks.append(np.zeros(self.correlated.count) if by_noise is None else cotangent @ by_noise)
         if self.error is not None:
             blocks.append(self.error.jacobian(by_nodes.ravel()))
         return np.concatenate(blocks)
 
-    def _by_pose(self, trial: Trial, directions: Floats, points: Floats) -> Floats | None:
+    def _by_pose(self, evaluation: Evaluation, directions: Floats, points: Floats) -> Floats | None:
         """Of distances along directions, (p, 3), to points of the body's coordinates, (p, 3): (p, 6), if it is unknown.
 
         What the camera sees stays where it is: in the body's coordinates it moves against the pose.
         """
         if self.pose is None:
             return None
-        assert trial.pose is not None
-        in_camera = self.pose.jacobian(trial.coefficients[self.pose_part], points)
-        along = directions @ trial.pose.rotation.T  # directions in the camera's axes
+        assert evaluation.pose is not None
+        in_camera = self.pose.jacobian(evaluation.coefficients[self.pose_part], points)
+        along = directions @ evaluation.pose.rotation.T  # directions in the camera's axes
         return np.einsum("pi,pij->pj", along, in_camera)
 
-    def moved(self, trial: Trial, change: Floats) -> Floats:
+    def moved(self, evaluation: Evaluation, change: Floats) -> Floats:
         """How far some hundred nodes, spread over those observed, move for a change, first order, (m,), metres."""
         every = max(1, len(self.observed.nodes) // _WATCHED)
-        shifted = trial.state.moved(change[self.force_part], every)
+        shifted = evaluation.state.moved(change[self.force_part], every)
         if self.pose is not None:
             twist = self.pose.deviations * change[self.pose_part]
             arm = self.observed.body.points[self.observed.nodes[::every]] - self.pose.centre
             shifted = shifted + (np.cross(twist[:3], arm) + twist[3:])
-        if self.conditions is not None:
-            pushed = cast(ConditionedState, trial.state).by_conditions().reshape(-1, 3, self.conditions.count)
-            shifted = shifted + pushed[self.observed.nodes[::every]] @ change[self.condition_part]
+        if self.parameter_blocks is not None:
+            pushed = (
+                cast(ParametrisedState, evaluation.state).by_parameters().reshape(-1, 3, self.parameter_blocks.count)
+            )
+            shifted = shifted + pushed[self.observed.nodes[::every]] @ change[self.parameter_part]
         if self.error is not None:
             shifted = shifted + self.error.observed_field(change[self.error_part], every)
         return np.sqrt(np.einsum("pi,pi->p", shifted, shifted))
 
-    def growth(self, trial: Trial) -> tuple[float, Floats]:
+    def stiffness_scaling(self, evaluation: Evaluation) -> tuple[float, Floats]:
         """Factor by which forces grow with the body's stiffness, and its derivative by the conditions' coefficients."""
-        if self.conditions is None:
+        if self.parameter_blocks is None:
             return 1.0, np.zeros(0)
-        return self.conditions.growth(trial.coefficients[self.condition_part])
+        return self.parameter_blocks.stiffness_scaling(evaluation.coefficients[self.parameter_part])
 
-    def nodal_forces(self, trial: Trial) -> Floats:
+    def nodal_forces(self, evaluation: Evaluation) -> Floats:
         """All that is unknown of the nodal forces, (n, 3), newtons."""
-        found = self.growth(trial)[0] * self.forces.forces(trial.coefficients[self.force_part])
-        if self.conditions is not None:
-            found = found + self.conditions.forces(trial.coefficients[self.condition_part])
+        found = self.stiffness_scaling(evaluation)[0] * self.forces.forces(evaluation.coefficients[self.force_part])
+        if self.parameter_blocks is not None:
+            found = found + self.parameter_blocks.forces(evaluation.coefficients[self.parameter_part])
         return found
 
-    def net_forces(self, trial: Trial) -> Floats:
+    def net_forces(self, evaluation: Evaluation) -> Floats:
         """Derivative of their net force by the coefficients, (3, k), newtons."""
         whole = np.zeros((3, self.size))
-        growth, slopes = self.growth(trial)
-        whole[:, self.force_part] = growth * self.forces.net_basis
-        if self.conditions is not None:
-            net = self.forces.net_basis @ trial.coefficients[self.force_part]
-            own = self.conditions.net_forces(trial.coefficients[self.condition_part])
-            whole[:, self.condition_part] = own + net[:, None] * slopes
+        stiffness_scaling, slopes = self.stiffness_scaling(evaluation)
+        whole[:, self.force_part] = stiffness_scaling * self.forces.net_basis
+        if self.parameter_blocks is not None:
+            net = self.forces.net_basis @ evaluation.coefficients[self.force_part]
+            own = self.parameter_blocks.net_forces(evaluation.coefficients[self.parameter_part])
+            whole[:, self.parameter_part] = own + net[:, None] * slopes
         return whole
 
     def is_too_far(self, change: Floats) -> bool:
         """Whether a change of the coefficients is more than one step may make, however little it moves."""
-        return self.conditions is not None and self.conditions.is_too_far(change[self.condition_part])
+        return self.parameter_blocks is not None and self.parameter_blocks.is_too_far(change[self.parameter_part])

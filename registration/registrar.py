@@ -16,24 +16,33 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.meshes.clouds import check_cloud
 from softtwin.reference.data.outcome import NotConverged
 
-from .anchored import Anchored
 from .cloud import Cloud
-from .conditions import Conditions
 from .correlated import CorrelatedNoise, is_noise
-from .evidence import Scale
 from .forward import ForwardModel, ReducedModel, reduce_model
-from .gauss_newton import Found, GaussNewton
+from .gauss_newton import GaussNewton, SolverResult
+from .hyperparameters import LogNormalPrior
+from .landmarks import LandmarkPairs
 from .lbfgs import LBFGS
 from .loss import robust_deviation
-from .marks import Marks
+from .manifold_mapping import ManifoldMapping
 from .options import NOISE, RegistrationOptions
 from .outcome import Outcome
+from .parameter_blocks import ParameterBlocks
 from .pose import Pose
 from .prepared import Prepared
-from .problem import Problem, Trial
+from .priors import (
+    LikelihoodInformed,
+    ModelError,
+    NodalForces,
+    PosePrior,
+    contact,
+    known_forces,
+    localised,
+    nodal_forces,
+)
+from .problem import Evaluation, Problem
 from .residuals import SurfaceDistance
 from .result import Registration, badness
-from .unknowns import Forces, Informed, ModelError, PosePrior, contact, known_forces, nodal_forces, windowed
 from .verdict import Expectations, Verdict, judge, shared
 
 Floats = NDArray[np.float64]
@@ -74,7 +83,7 @@ class Registrar:
         options: noise, solver, thinning, search for the place of the forces.
         pose: prior of the pose; None for clouds in the body's coordinates.
         expectations: what a usable result looks like; by the body's size and the noise if not given.
-        conditions: unknowns beside the forces, which the model takes; none if not given.
+        parameter_blocks: unknowns beside the forces, which the model takes; none if not given.
         modulus_deviation: of the logarithm of Young's modulus, where this is no unknown: forces found are the more in
             doubt by it. Under nodal forces alone states depend on forces over stiffness, and are not.
         anywhere: makes the same with forces anywhere, which is asked where neighbouring points are missed alike; None
@@ -88,34 +97,34 @@ class Registrar:
         self,
         model: ForwardModel,
         observed: SurfaceDistance,
-        forces: Forces,
+        forces: NodalForces,
         options: RegistrationOptions | None = None,
         *,
         pose: PosePrior | None = None,
         expectations: Expectations | None = None,
-        conditions: Conditions | None = None,
+        parameter_blocks: ParameterBlocks | None = None,
         modulus_deviation: float = 0.0,
         anywhere: Callable[[], Registrar] | None = None,
     ) -> None:
         if not 0.0 <= modulus_deviation < np.inf:
             raise ValueError(f"Registrar.modulus_deviation: expected 0 or more, got {modulus_deviation}.")
         self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
-        is_found = conditions is not None and conditions.modulus is not None
-        self.conditions, self.modulus_deviation = conditions, 0.0 if is_found else modulus_deviation
+        is_found = parameter_blocks is not None and parameter_blocks.modulus is not None
+        self.parameter_blocks, self.modulus_deviation = parameter_blocks, 0.0 if is_found else modulus_deviation
         self.anywhere = None if anywhere is None else cache(anywhere)  # made when it is first asked for
-        self.marks: Marks | None = None
+        self.landmarks: LandmarkPairs | None = None
         self.correlated: CorrelatedNoise | None = None
         self.options = options or RegistrationOptions()
         discrepancy = model.discrepancy
         self.error = None if discrepancy is None else ModelError.of(discrepancy, observed.nodes)
         # Where it is not known what the model gets wrong, points tell no more than the model can meet.
-        self.noise = self.options.noise.at_least(model.error)
+        self.noise = self.options.noise.with_minimum(model.error)
         self.expectations = expectations or Expectations.of(model, self.noise)
         self._everywhere = self._prepared(forces)
-        self._fast: tuple[ForwardModel, Forces, ReducedModel] | None = None
+        self._fast: tuple[ForwardModel, NodalForces, ReducedModel] | None = None
 
-    def _prepared(self, forces: Forces) -> Prepared:
-        return Prepared.of(self.model, self.observed, forces, self.conditions)
+    def _prepared(self, forces: NodalForces) -> Prepared:
+        return Prepared.of(self.model, self.observed, forces, self.parameter_blocks)
 
     def with_pose(self, pose: PosePrior, options: RegistrationOptions) -> Registrar:
         """The same with an unknown pose, and the options that suit it."""
@@ -126,7 +135,7 @@ class Registrar:
             self.forces,
             options,
             pose=pose,
-            conditions=self.conditions,
+            parameter_blocks=self.parameter_blocks,
             modulus_deviation=self.modulus_deviation,
             anywhere=None if anywhere is None else lambda: anywhere().with_pose(pose, options),
         )
@@ -137,17 +146,17 @@ class Registrar:
         other.options = replace(self.options, solver=replace(self.options.solver, until=until))
         return other
 
-    def marked(self, marks: Marks | None) -> Registrar:
+    def with_landmarks(self, landmarks: LandmarkPairs | None) -> Registrar:
         """The same with landmarks that pull beside the cloud, or without.
 
         Args:
-            marks: of the same observed side; None for none.
+            landmarks: of the same observed side; None for none.
         """
         other = copy.copy(self)
-        other.marks = marks
+        other.landmarks = landmarks
         return other
 
-    def believing(self, correlated: CorrelatedNoise | None) -> Registrar:
+    def with_prior(self, correlated: CorrelatedNoise | None) -> Registrar:
         """The same with noise that the points of a cloud share, or without.
 
         Args:
@@ -174,19 +183,19 @@ class Registrar:
         """The result, doubtful where forces elsewhere explain what the cloud has left and neighbours share."""
         if self.anywhere is None or not found.judgement.is_usable:
             return found
-        match = found.trial.match  # with those points that were taken for outliers: patches of them are none
-        alike = shared(self.observed.feet(match), match.distances, np.ones(len(match.distances)))
-        is_missed = found.rms_distance * np.sqrt(alike) > _MISSED * self.noise.least
+        match = found.evaluation.match  # with those points that were taken for outliers: patches of them are none
+        inflation_factor = shared(self.observed.closest_points(match), match.distances, np.ones(len(match.distances)))
+        is_missed = found.rms_distance * np.sqrt(inflation_factor) > _MISSED * self.noise.minimum
         if not is_missed or self._is_late:
             return found
         with suppress(NotConverged):
-            other = self.anywhere().limited(self.options.solver.until).marked(self.marks).register(cloud)
+            other = self.anywhere().limited(self.options.solver.until).with_landmarks(self.landmarks).register(cloud)
             if other.judgement.is_usable and other.rms_distance < _EXPLAINED * found.rms_distance:
                 reason = (
                     f"forces outside the zone explain the cloud better: points lie {1e3 * found.rms_distance:.2f} mm "
                     f"from the surface, with forces anywhere {1e3 * other.rms_distance:.2f} mm"
                 )
-                return found.doubted(reason)
+                return found.with_reason(reason)
         return found
 
     def _registered(self, cloud: ArrayLike, start: Registration | None) -> Registration:
@@ -195,7 +204,7 @@ class Registrar:
         if start is None:
             return self._afresh(points, begin)
         before = start.problem.correlated
-        like = self.believing(_still_there(before, points))
+        like = self.with_prior(_still_there(before, points))
         if before is not None and like.correlated is None:
             return self._afresh(points, begin)
         result = like._followed(points, start, begin)
@@ -223,28 +232,28 @@ class Registrar:
     def _followed(self, points: Cloud, start: Registration, begin: float) -> Registration:
         """From the frame before, or from rest with its forces."""
         points = self._enough(points)
-        problem = self._problem(points, start.prepared, start.trial, start.doubt)
-        near = problem.begun(problem.carried(start.trial.coefficients, start.problem), start.trial)
+        problem = self._problem(points, start.prepared, start.evaluation, start.discrepancy_scale)
+        near = problem.begun(problem.carried(start.evaluation.coefficients, start.problem), start.evaluation)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
             found = self._from_rest(points, start.prepared, self.options.solver)
             return self._finished(points, start.prepared, found, begin)
         solver = self.options.solver.following()
         found = solver.solve(problem, near.coefficients, near)
-        problem, found, doubt = self._doubted(problem, found, start.doubt, solver)
-        return self._result(problem, found, start.prepared, begin, doubt)
+        problem, found, discrepancy_scale = self._doubted(problem, found, start.discrepancy_scale, solver)
+        return self._result(problem, found, start.prepared, begin, discrepancy_scale)
 
     def _told_apart(self, found: Registration, again: _Again) -> Registration:
         """The result; where its cloud has noise that neighbours share, what is found with that in mind.
 
         Forces have explained such noise as far as they can: only where it is left to itself it is seen as it is, so
         that a guess is good enough for a second try, and that one decides. What is shared over less than the edges of
-        the surface is the mesh's own, or noise that no force can follow: for that points are counted (`alike`). What
+        the surface is the mesh's own, or noise that no force can follow: the `inflation_factor` reckons with that. What
         would be larger than any noise, and leaves the search without an end, is none: nothing here explains it.
         """
         if not self.options.correlated or found.problem.correlated is not None or found.local is None:
             return found
         is_worth_it = found.outcome is not Outcome.REFUSED and found.noise < _HOPELESS * self.expectations.noise
-        if not is_worth_it or not _is_shared(found, self.noise.least):
+        if not is_worth_it or not _is_shared(found, self.noise.minimum):
             return found
         told, best, near = found.local.correlated(_A_TRY), found, found
         for _ in range(_TRIES):
@@ -253,7 +262,7 @@ class Registrar:
             if self._is_late:
                 return _out_of_time(best, told[1])
             try:
-                near = again(self.believing(_noise_of(near, *told)), near)
+                near = again(self.with_prior(_noise_of(near, *told)), near)
             except NotConverged:
                 break
             before, told = told, None if near.local is None else near.local.correlated(_WORTH)
@@ -279,7 +288,7 @@ class Registrar:
     ) -> Registration:
         """What this model makes of a cloud, from what a faster model of the same body has found for it.
 
-        Most of the way is the faster model's, moved to this one's states (see `Anchored`); the end is this one's.
+        Most of the way is the faster model's, corrected by this one's (`ManifoldMapping`); the end is this one's.
 
         Args:
             cloud: observed points, (p, 3), metres.
@@ -297,7 +306,7 @@ class Registrar:
         noise = draft.problem.correlated
         if noise is None and last is not None:
             noise = _still_there(last.problem.correlated, points)
-        like = self.believing(noise)
+        like = self.with_prior(noise)
         found = like._refined(points, draft, fast, last, begin)
         before, drafted = 0 if last is None else last.looked_for, draft.looked_for if draft.unexplained == 0.0 else 0
         if 0 < max(drafted, before) < _AGAIN:
@@ -314,7 +323,7 @@ class Registrar:
             return self._carried_on(points, fast, last, begin)
         # Told a zone, the exact model gathers no forces within it, and takes none that were: see `options_for`.
         prepared = self._everywhere
-        if self.options.gathering.rounds:
+        if self.options.localisation.rounds:
             prepared = self._prepared(replace(draft.prepared.forces, scale=self.forces.scale))
         problem = self._plain(points, prepared)
         start = np.zeros(problem.size)
@@ -322,35 +331,37 @@ class Registrar:
         start[problem.pose_part] = draft.coefficients[draft.problem.pose_part]
         if draft.problem.correlated is self.correlated:
             start[problem.noise_part] = draft.coefficients[draft.problem.noise_part]
-        found = self._approached(problem, problem.begun(start, draft.trial), fast, solver)
+        found = self._approached(problem, problem.begun(start, draft.evaluation), fast, solver)
         return self._finished(points, prepared, found, begin)
 
     def _carried_on(self, points: Cloud, fast: ForwardModel, last: Registration, begin: float) -> Registration:
-        problem = self._problem(points, last.prepared, last.trial, last.doubt)
+        problem = self._problem(points, last.prepared, last.evaluation, last.discrepancy_scale)
         solver = self.options.solver.following()
-        near = replace(last.trial, coefficients=problem.carried(last.trial.coefficients, last.problem))
+        near = replace(last.evaluation, coefficients=problem.carried(last.evaluation.coefficients, last.problem))
         found = self._approached(problem, near, fast, solver)
-        problem, found, doubt = self._doubted(problem, found, last.doubt, solver)
-        return self._result(problem, found, last.prepared, begin, doubt)
+        problem, found, discrepancy_scale = self._doubted(problem, found, last.discrepancy_scale, solver)
+        return self._result(problem, found, last.prepared, begin, discrepancy_scale)
 
-    def _approached(self, problem: Problem, near: Trial, fast: ForwardModel, solver: GaussNewton | LBFGS) -> Found:
+    def _approached(
+        self, problem: Problem, near: Evaluation, fast: ForwardModel, solver: GaussNewton | LBFGS
+    ) -> SolverResult:
         """The minimum, to which the fast model knows most of the way from any trial of the exact one.
 
         A fast model takes no conditions: with them, and where the exact one finds no state, the way is the latter's, as
         it is of L-BFGS, which wants the whole body's slopes.
         """
-        spent: list[Found] = []
+        spent: list[SolverResult] = []
         for _ in range(_ANCHORS):
-            if problem.conditions is not None or not isinstance(solver, GaussNewton):
+            if problem.parameter_blocks is not None or not isinstance(solver, GaussNewton):
                 break
             place = near.coefficients[problem.force_part]
             reduced = self._reduced(fast, problem.forces)
-            cheap = replace(problem, model=Anchored.at(reduced, self.observed.nodes, place, near.state))
+            cheap = replace(problem, model=ManifoldMapping.at(reduced, self.observed.nodes, place, near.state))
             way = solver.solve(cheap, near.coefficients, cheap.begun(near.coefficients))
             if not way.trace or self._is_late:
                 break
             try:
-                near = problem.trial(way.trial.coefficients, replace(way.trial, state=near.state))
+                near = problem.evaluation(way.evaluation.coefficients, replace(way.evaluation, state=near.state))
             except NotConverged:
                 break
             spent.append(replace(way, evaluations=1))  # states of the exact model alone are counted
@@ -360,7 +371,7 @@ class Registrar:
             near = problem.begun(near.coefficients.copy(), near)
         return reduce(_after, [*spent, solver.solve(problem, near.coefficients, near)])
 
-    def _reduced(self, fast: ForwardModel, forces: Forces) -> ReducedModel:
+    def _reduced(self, fast: ForwardModel, forces: NodalForces) -> ReducedModel:
         """The fast model between this one's forces and the observed nodes; that of the last forces is kept."""
         if self._fast is None or self._fast[0] is not fast or self._fast[1] is not forces:
             self._fast = fast, forces, reduce_model(fast, self.observed.nodes, forces.basis)
@@ -397,19 +408,19 @@ class Registrar:
             forces=prepared.forces,
             pose=self.pose,
             noise=self.noise,
-            conditions=self.conditions,
-            marks=self.marks,
-            leaning=self.options.normal_deviation,
+            parameter_blocks=self.parameter_blocks,
+            landmarks=self.landmarks,
+            normal_deviation=self.options.normal_deviation,
             correlated=self.correlated,
         )
 
-    def _problem(self, points: Cloud, prepared: Prepared, near: Trial, doubt: float = 1.0) -> Problem:
+    def _problem(self, points: Cloud, prepared: Prepared, near: Evaluation, discrepancy_scale: float = 1.0) -> Problem:
         """The problem with the model's error in patterns, of the size that belongs to a movement like a trial's."""
         plain = self._plain(points, prepared)
         if self.error is None:
             return plain
         moved = np.linalg.norm(near.positions, axis=1).max() + near.match.rms
-        error = replace(self.error, size=doubt * float(moved))
+        error = replace(self.error, size=discrepancy_scale * float(moved))
         return replace(plain, error=error, noise=self.options.noise)
 
     def _cold(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
@@ -417,14 +428,14 @@ class Registrar:
 
         Where time is over before the end, the better one of this and what is known; that at once, if it is accepted.
         """
-        prepared, gathering, solver = self._everywhere, self.options.gathering, self.options.solver
-        few, is_gathered = points.thinned(gathering.points), gathering.rounds > 0
+        prepared, localisation, solver = self._everywhere, self.options.localisation, self.options.solver
+        few, is_gathered = points.thinned(localisation.points), localisation.rounds > 0
         begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
         found = self._from_rest(*begun)
-        for left in reversed(range(gathering.rounds)):
+        for left in reversed(range(localisation.rounds)):
             if self._is_hopeless(found) or self._is_late:
                 break
-            prepared = self._gathered(prepared.forces.forces(found.trial.coefficients[: prepared.forces.size]))
+            prepared = self._gathered(prepared.forces.forces(found.evaluation.coefficients[: prepared.forces.size]))
             found = _after(found, self._from_rest(few if left else points, prepared, solver))
         if known is not None and self._is_late and known.judgement.verdict is Verdict.ACCEPTED:
             return known
@@ -441,72 +452,74 @@ class Registrar:
         start = np.zeros(problem.size)
         start[problem.force_part] = prepared.forces.nearest(near.unknown_forces)
         start[problem.pose_part] = near.coefficients[before.pose_part]
-        start[problem.condition_part] = near.coefficients[before.condition_part]
-        found = self.options.solver.solve(problem, start, near.trial)
+        start[problem.parameter_part] = near.coefficients[before.parameter_part]
+        found = self.options.solver.solve(problem, start, near.evaluation)
         return self._finished(points, prepared, found, begin)
 
-    def _from_rest(self, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> Found:
+    def _from_rest(self, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> SolverResult:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
-        few, first = points.thinned(self.options.gathering.points), prepared.leading(_LEADING)
+        few, first = points.thinned(self.options.localisation.points), prepared.leading(_LEADING)
         rough, problem = self._plain(few, first), self._plain(points, prepared)
         begun = solver.rough().solve(rough, np.zeros(rough.size))
         start = np.zeros(problem.size)
-        start[: first.forces.size] = begun.trial.coefficients[rough.force_part]
-        start[problem.pose_part] = begun.trial.coefficients[rough.pose_part]
-        start[problem.condition_part] = begun.trial.coefficients[rough.condition_part]
-        start[problem.noise_part] = begun.trial.coefficients[rough.noise_part]
+        start[: first.forces.size] = begun.evaluation.coefficients[rough.force_part]
+        start[problem.pose_part] = begun.evaluation.coefficients[rough.pose_part]
+        start[problem.parameter_part] = begun.evaluation.coefficients[rough.parameter_part]
+        start[problem.noise_part] = begun.evaluation.coefficients[rough.noise_part]
         if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
             solver = solver.without_steps()
-        return _after(begun, solver.solve(problem, start, begun.trial))
+        return _after(begun, solver.solve(problem, start, begun.evaluation))
 
     def _finished(
-        self, points: Cloud, prepared: Prepared, found: Found, begin: float, is_settled: bool = True
+        self, points: Cloud, prepared: Prepared, found: SolverResult, begin: float, is_settled: bool = True
     ) -> Registration:
         """With all points, and with the model's error in patterns, from a result that took it for noise."""
-        solver, doubt, is_hopeless = self.options.solver, 1.0, self._is_hopeless(found)
+        solver, discrepancy_scale, is_hopeless = self.options.solver, 1.0, self._is_hopeless(found)
         if is_hopeless:
             solver = solver.without_steps()
         believed = prepared if self.error is not None else self._believed(prepared, found)
-        problem = self._problem(points, believed, found.trial)
-        is_settled = is_settled and believed is prepared and len(found.trial.cloud) == len(points)
+        problem = self._problem(points, believed, found.evaluation)
+        is_settled = is_settled and believed is prepared and len(found.evaluation.cloud) == len(points)
         if self.error is not None or not is_settled:
-            errors = np.zeros(problem.size - len(found.trial.coefficients))
-            start = np.concatenate([found.trial.coefficients, errors])
-            found = _after(found, solver.solve(problem, start, found.trial))
+            errors = np.zeros(problem.size - len(found.evaluation.coefficients))
+            start = np.concatenate([found.evaluation.coefficients, errors])
+            found = _after(found, solver.solve(problem, start, found.evaluation))
         wider = self._believed(believed, found)
         if wider is not believed:  # seen only now that the model's error is told from noise
             believed, problem = wider, replace(problem, forces=wider.forces)
-            found = _after(found, solver.solve(problem, found.trial.coefficients, found.trial))
+            found = _after(found, solver.solve(problem, found.evaluation.coefficients, found.evaluation))
         if not is_hopeless:
-            problem, found, doubt = self._doubted(problem, found, doubt, self.options.solver.following())
-        return self._result(problem, found, believed, begin, doubt)
+            problem, found, discrepancy_scale = self._doubted(
+                problem, found, discrepancy_scale, self.options.solver.following()
+            )
+        return self._result(problem, found, believed, begin, discrepancy_scale)
 
-    def _believed(self, prepared: Prepared, found: Found) -> Prepared:
+    def _believed(self, prepared: Prepared, found: SolverResult) -> Prepared:
         """The forces' size as the cloud tells it, where it can: what was expected would call a sharp pull outliers."""
-        belief, noise = self.options.belief, found.posterior.scales.noise
-        is_told = (noise < belief.clear or noise > belief.loud) and self.correlated is None
-        if not is_told or prepared.forces.scale.spread >= belief.spread:
+        hyperprior, noise = self.options.hyperprior, found.posterior.scales.noise
+        is_told = (noise < hyperprior.clear or noise > hyperprior.loud) and self.correlated is None
+        if not is_told or prepared.forces.scale.spread >= hyperprior.spread:
             return prepared
-        return prepared.believing(belief.spread)
+        return prepared.with_prior(hyperprior.spread)
 
-    def _is_hopeless(self, found: Found) -> bool:
+    def _is_hopeless(self, found: SolverResult) -> bool:
         if found.outcome is Outcome.OUT_OF_TIME:  # who knows
             return False
         return found.posterior.scales.noise > _HOPELESS * self.expectations.noise
 
     def _doubted(
-        self, problem: Problem, found: Found, doubt: float, solver: GaussNewton | LBFGS
-    ) -> tuple[Problem, Found, float]:
+        self, problem: Problem, found: SolverResult, discrepancy_scale: float, solver: GaussNewton | LBFGS
+    ) -> tuple[Problem, SolverResult, float]:
         """Once more where the model's error, or the noise that neighbours share, is larger or smaller than was said."""
         for _ in range(_DOUBTS):
             if not found.outcome.is_success:
                 break
-            start, was = found.trial.coefficients.copy(), problem
+            start, was = found.evaluation.coefficients.copy(), problem
             if problem.error is not None:
                 factor = _resized(found, problem.error_part)
-                factor = min(max(factor, _LEAST_DOUBT / doubt), _MOST_DOUBT / doubt)
+                factor = min(max(factor, _LEAST_DOUBT / discrepancy_scale), _MOST_DOUBT / discrepancy_scale)
                 if abs(np.log(factor)) >= _SURE:
-                    doubt *= factor
+                    discrepancy_scale *= factor
                     problem = replace(problem, error=replace(problem.error, size=factor * problem.error.size))
                     start[problem.error_part] /= factor
             if problem.correlated is not None:
@@ -516,24 +529,24 @@ class Registrar:
                     start[problem.noise_part] /= factor
             if problem is was:
                 break
-            found = _after(found, solver.last().solve(problem, start, found.trial))
-        return problem, found, doubt
+            found = _after(found, solver.last().solve(problem, start, found.evaluation))
+        return problem, found, discrepancy_scale
 
     def _gathered(self, nodal: Floats) -> Prepared:
         """The unknown forces once more, where forces were found."""
         body = self.model.body
-        where = contact(self.forces, nodal, body.points, self.options.gathering.reach * body.size)
-        every = self._prepared(windowed(self.forces, where))
-        return every.informed(self.observed, self.options.gathering.informed)
+        where = contact(self.forces, nodal, body.points, self.options.localisation.reach * body.size)
+        every = self._prepared(localised(self.forces, where))
+        return every.informed(self.observed, self.options.localisation.informed)
 
     def _enough(self, points: Cloud) -> Cloud:
         """Of points that share noise no more than show it: what its pattern leaves out would be believed of each."""
         return points if self.correlated is None else points.thinned(_SHARING)
 
-    def _is_nearer_at_rest(self, near: Trial, start: Registration) -> bool:
+    def _is_nearer_at_rest(self, near: Evaluation, start: Registration) -> bool:
         """True where a cloud lies nearer to the body at rest than to what the last frame has found."""
         far = robust_deviation(near.match.distances)
-        if far < _FAR * max(start.noise, self.options.noise.least):
+        if far < _FAR * max(start.noise, self.options.noise.minimum):
             return False
         few = near.cloud[:: max(1, len(near.cloud) // _GLANCE)]
         rest = self.observed.match(np.zeros_like(near.positions), few)
@@ -541,12 +554,12 @@ class Registrar:
 
     def _has_left(self, result: Registration, start: Registration) -> bool:
         """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
-        return result.scatter > _LEFT * max(start.scatter, self.noise.least)
+        return result.scatter > _LEFT * max(start.scatter, self.noise.minimum)
 
     def _checked(self, cloud: ArrayLike) -> Cloud:
         given = Cloud.of(cloud)
         if given.is_finite:
-            given = given.thinned(self.options.most_points).distinct()
+            given = given.thinned(self.options.maximum_points).distinct()
             if self.pose is not None:
                 check_cloud(self.pose.mean.inverse().apply(given.points), self.model.body)
                 return given
@@ -559,38 +572,40 @@ class Registrar:
             return pose, Pose.identity()
         return self.pose.mean, pose.then(self.pose.mean.inverse())
 
-    def _result(self, problem: Problem, found: Found, prepared: Prepared, begin: float, doubt: float) -> Registration:
-        alike = found.local.alike()
-        found = replace(found, posterior=found.local.posterior(alike))
-        trial, net = found.trial, problem.net_forces(found.trial)
-        nodal = problem.nodal_forces(trial)
+    def _result(
+        self, problem: Problem, found: SolverResult, prepared: Prepared, begin: float, discrepancy_scale: float
+    ) -> Registration:
+        inflation_factor = found.local.inflation_factor()
+        found = replace(found, posterior=found.local.posterior(inflation_factor))
+        evaluation, net = found.evaluation, problem.net_forces(found.evaluation)
+        nodal = problem.nodal_forces(evaluation)
         total = nodal.sum(axis=0)
         covariance = found.posterior.net_force_covariance(net, prepared.forces.left_out)
         covariance += self.modulus_deviation**2 * total[:, None] * total
-        state = trial.state.full
-        pose, askew = self._told_in(trial.pose or Pose.identity())
-        correction = problem.correction(trial)
+        state = evaluation.state.full
+        pose, pose_correction = self._told_in(evaluation.pose or Pose.identity())
+        correction = problem.correction(evaluation)
         moved = self.model.body.points + state.displacement + correction
         return Registration(
             prepared=prepared,
-            trial=trial,
+            evaluation=evaluation,
             forces=nodal,
             state=state,
-            correction=correction + (askew.apply(moved) - moved),
-            doubt=doubt,
-            alike=alike,
+            correction=correction + (pose_correction.apply(moved) - moved),
+            discrepancy_scale=discrepancy_scale,
+            inflation_factor=inflation_factor,
             pose=pose,
-            askew=askew,
+            pose_correction=pose_correction,
             net_force=total,
             net_force_covariance=covariance,
             noise=found.posterior.scales.noise,
             force_scale=found.posterior.scales.force,
-            rms_distance=trial.match.rms,
+            rms_distance=evaluation.match.rms,
             outliers=float(np.mean(found.weights < 0.05)),
             informed=found.posterior.informed,
             points=len(problem.cloud),
             outcome=found.outcome,
-            judgement=judge(problem, found, state, self.expectations, doubt),
+            judgement=judge(problem, found, state, self.expectations, discrepancy_scale),
             evaluations=found.evaluations,
             seconds=time.perf_counter() - begin,
             trace=found.trace,
@@ -610,7 +625,7 @@ def prepare(
     directions: int = 64,
     options: RegistrationOptions | None = None,
     pose: PosePrior | None = None,
-    conditions: Conditions | None = None,
+    parameter_blocks: ParameterBlocks | None = None,
     modulus_deviation: float = 0.0,
     elsewhere: ArrayLike | None = None,
 ) -> Registrar:
@@ -625,7 +640,7 @@ def prepare(
         directions: most directions of force kept.
         options: noise, solver, thinning, search for the place of the forces.
         pose: prior of the pose; None for clouds in the body's coordinates.
-        conditions: unknowns beside the forces; none if not given. Nodes that they move carry no unknown force.
+        parameter_blocks: unknowns beside the forces; none if not given. Nodes that they move carry no unknown force.
         modulus_deviation: as for `Registrar`.
         elsewhere: further nodes, where forces are thought of when those given leave what neighbouring points share.
 
@@ -634,19 +649,19 @@ def prepare(
     """
     options = options or RegistrationOptions()
     observed = SurfaceDistance(model.body, triangles, options.distance)
-    scale = Scale(force_scale, _SPREAD, least=1e-2 * force_scale)
+    scale = LogNormalPrior(force_scale, _SPREAD, minimum=1e-2 * force_scale)
     if nodes is None:
-        if conditions is None and pose is None:
+        if parameter_blocks is None and pose is None:
             raise ValueError("prepare.nodes: expected nodes that may carry force where nothing else is unknown.")
-        options = replace(options, gathering=replace(options.gathering, rounds=0))
+        options = replace(options, localisation=replace(options.localisation, rounds=0))
         forces = known_forces(model.body, scale)
     else:
         carrying = np.asarray(nodes, dtype=np.int64)
-        if conditions is not None:
-            carrying = np.setdiff1d(carrying, conditions.moved)
+        if parameter_blocks is not None:
+            carrying = np.setdiff1d(carrying, parameter_blocks.moved)
         every = nodal_forces(model.body, carrying, scale, smoothness)
-        rule = Informed(options.noise.least, scale=10.0 * force_scale, most=directions)
-        forces = Prepared.of(model, observed, every, conditions).informed(observed, rule).forces
+        rule = LikelihoodInformed(options.noise.minimum, scale=10.0 * force_scale, maximum=directions)
+        forces = Prepared.of(model, observed, every, parameter_blocks).informed(observed, rule).forces
 
     def anywhere() -> Registrar:
         return prepare(
@@ -658,7 +673,7 @@ def prepare(
             directions=directions,
             options=options,
             pose=pose,
-            conditions=conditions,
+            parameter_blocks=parameter_blocks,
         )
 
     return Registrar(
@@ -667,7 +682,7 @@ def prepare(
         forces,
         options,
         pose=pose,
-        conditions=conditions,
+        parameter_blocks=parameter_blocks,
         modulus_deviation=modulus_deviation,
         anywhere=None if elsewhere is None or nodes is None else anywhere,
     )
@@ -693,29 +708,29 @@ def _carried(result: Registration, before: Registration) -> Registration:
 
 def _doubtful(found: Registration, length: float, why: str) -> Registration:
     """The result with one reason more: neighbours within a length, metres, err alike."""
-    return found.doubted(f"points within {1e3 * length:.0f} mm of each other err alike, {why}")
+    return found.with_reason(f"points within {1e3 * length:.0f} mm of each other err alike, {why}")
 
 
-def _resized(found: Found, part: slice) -> float:
+def _resized(found: SolverResult, part: slice) -> float:
     """Factor by which unknowns of unit variance are larger than was said, or smaller.
 
     It is MacKay's (1992): the squares of the unknowns over the number that the cloud tells of them.
     """
-    unknown = found.trial.coefficients[part]
+    unknown = found.evaluation.coefficients[part]
     known = len(unknown) - float(np.diag(found.posterior.covariance)[part].sum())
     return float(np.sqrt((unknown @ unknown + _BELIEF) / (known + _BELIEF)))
 
 
-def _is_shared(found: Registration, least: float) -> bool:
+def _is_shared(found: Registration, minimum: float) -> bool:
     """Whether neighbours share of what a cloud has left more than the least noise, and more than chance has them."""
-    match = found.trial.match
-    part = shared(found.problem.observed.feet(match), match.distances, np.ones(len(match.distances)))
-    return part > _ALIKE and found.rms_distance * np.sqrt(part) > least
+    match = found.evaluation.match
+    part = shared(found.problem.observed.closest_points(match), match.distances, np.ones(len(match.distances)))
+    return part > _ALIKE and found.rms_distance * np.sqrt(part) > minimum
 
 
 def _noise_of(found: Registration, size: float, length: float) -> CorrelatedNoise:
     """Noise of a size and a length, metres, for the cloud of a result."""
-    return CorrelatedNoise.over(found.problem.cloud, found.problem.normals(found.trial), size, length)
+    return CorrelatedNoise.over(found.problem.cloud, found.problem.normals(found.evaluation), size, length)
 
 
 def _is_noise(correlated: CorrelatedNoise | None) -> bool:
@@ -724,12 +739,12 @@ def _is_noise(correlated: CorrelatedNoise | None) -> bool:
 
 def _still_there(correlated: CorrelatedNoise | None, points: Cloud) -> CorrelatedNoise | None:
     """The noise that neighbours shared in the frame before; None for hardly any, or for a cloud that lies elsewhere."""
-    if correlated is None or correlated.size < _GONE * NOISE.least or correlated.reaches(points.points) < _REACHED:
+    if correlated is None or correlated.size < _GONE * NOISE.minimum or correlated.reaches(points.points) < _REACHED:
         return None
     return correlated
 
 
-def _after(first: Found, second: Found) -> Found:
+def _after(first: SolverResult, second: SolverResult) -> SolverResult:
     """The second result, with what the first took."""
     return replace(second, evaluations=first.evaluations + second.evaluations, trace=(*first.trace, *second.trace))
 

@@ -22,7 +22,7 @@ _BESIDE = 1.0  # triangles: a point that lies further beside its own is measured
 
 
 @dataclass(frozen=True, eq=False)
-class Match:
+class Correspondence:
     """A cloud matched to a deformed surface.
 
     Args:
@@ -72,13 +72,13 @@ class SurfaceDistance:
         """A field of the nodes `nodes`, (m, ...), at the vertices of the observed side, (v, ...)."""
         return field if self._weights is None else self._weights @ field
 
-    def at_points(self, match: Match, field: Floats) -> Floats:
+    def at_points(self, match: Correspondence, field: Floats) -> Floats:
         """A number of each node of `nodes`, (m,), at the closest points of a match, (p,)."""
         corners = self._carried(field)[self.triangles[match.triangles]]
         found: Floats = np.einsum("pk,pk->p", match.weights, corners)
         return found
 
-    def match(self, displacement: Floats, cloud: Floats, near: Match | None = None) -> Match:
+    def match(self, displacement: Floats, cloud: Floats, near: Correspondence | None = None) -> Correspondence:
         """A cloud (p, 3) matched to the surface moved by the displacement (m, 3) of the nodes `nodes`, metres.
 
         Args:
@@ -91,7 +91,7 @@ class SurfaceDistance:
             return self._matched(positions, cloud, *self._closest.find(positions, cloud))
         return self._matched(positions, cloud, *self._closest.follow(positions, cloud, near.triangles))
 
-    def match_nearby(self, displacement: Floats, cloud: Floats) -> Match:
+    def match_nearby(self, displacement: Floats, cloud: Floats) -> Correspondence:
         """The same by a walk from each point's nearest vertex: faster than anew, in rare places not the closest.
 
         Args:
@@ -101,7 +101,9 @@ class SurfaceDistance:
         positions = self.rest + self._carried(displacement)
         return self._matched(positions, cloud, *self._closest.near(positions, cloud))
 
-    def match_beyond(self, displacement: Floats, cloud: Floats, near: Match, distance: float) -> Match:
+    def match_beyond(
+        self, displacement: Floats, cloud: Floats, near: Correspondence, distance: float
+    ) -> Correspondence:
         """A match found by walking, with the points that lie further than a distance from the surface searched anew.
 
         Args:
@@ -118,7 +120,7 @@ class SurfaceDistance:
         triangles[far], weights[far] = self._closest.find(positions, cloud[far])
         return self._matched(positions, cloud, triangles, weights)
 
-    def _matched(self, positions: Floats, cloud: Floats, triangles: Ints, weights: Floats) -> Match:
+    def _matched(self, positions: Floats, cloud: Floats, triangles: Ints, weights: Floats) -> Correspondence:
         corners = positions[self.triangles[triangles]]
         offsets = np.einsum("pk,pki->pi", weights, corners) - cloud
         lengths = np.sqrt(np.einsum("pi,pi->p", offsets, offsets))
@@ -127,10 +129,10 @@ class SurfaceDistance:
         on_it = lengths < 1e-12 * self.body.size
         directions = np.where(on_it[:, None], normals, offsets / np.where(on_it, 1.0, lengths)[:, None])
         side = np.where(np.einsum("pi,pi->p", directions, normals) < 0.0, -1.0, 1.0)
-        match = Match(side * lengths, side[:, None] * directions, triangles, weights, weights)
+        match = Correspondence(side * lengths, side[:, None] * directions, triangles, weights, weights)
         return match if self.distance == "surface" else _to_planes(match, corners, cloud, normals, doubled)
 
-    def facing(self, match: Match, displacement: Floats) -> Floats:
+    def facing(self, match: Correspondence, displacement: Floats) -> Floats:
         """Unit normals of the moved triangles that hold a match's closest points, (p, 3).
 
         Args:
@@ -139,7 +141,7 @@ class SurfaceDistance:
         """
         return _normals((self.rest + self._carried(displacement))[self.triangles[match.triangles]])[0]
 
-    def facing_rows(self, match: Match, displacement: Floats, along: Floats) -> csr_array:
+    def facing_rows(self, match: Correspondence, displacement: Floats, along: Floats) -> csr_array:
         """Derivative of these normals' components along vectors, (p q, 3m), by the displacement of the nodes.
 
         Exact while each closest point stays on its triangle, whose normal depends on its three corners alone.
@@ -164,18 +166,18 @@ class SurfaceDistance:
         indptr = np.arange(0, 9 * count + 1, 9)
         return self.by_nodes(csr_array((values.ravel(), columns.ravel(), indptr), shape=(count, 3 * len(self.rest))))
 
-    def feet(self, match: Match) -> Floats:
+    def closest_points(self, match: Correspondence) -> Floats:
         """The closest points of a match on the surface at rest, (p, 3), metres."""
         found: Floats = np.einsum("pk,pki->pi", match.weights, self.rest[self.triangles[match.triangles]])
         return found
 
-    def moved_feet(self, match: Match, displacement: Floats) -> Floats:
+    def moved_closest_points(self, match: Correspondence, displacement: Floats) -> Floats:
         """Where the closest points of a match at rest are after a displacement of `nodes`, (m, 3): (p, 3), metres."""
         corners = (self.rest + self._carried(displacement))[self.triangles[match.triangles]]
         found: Floats = np.einsum("pk,pki->pi", match.weights, corners)
         return found
 
-    def rows_by_axes(self, match: Match) -> csr_array:
+    def rows_by_axes(self, match: Correspondence) -> csr_array:
         """Derivative of the coordinates of a match's closest points by the displacement of the nodes, (3p, 3m)."""
         whole = csr_array(
             (
@@ -187,7 +189,7 @@ class SurfaceDistance:
         )
         return self.by_nodes(whole)
 
-    def rows(self, match: Match) -> csr_array:
+    def rows(self, match: Correspondence) -> csr_array:
         """Derivative of the distances with respect to the displacement of the observed nodes, (p, 3m).
 
         Exact: by the envelope theorem the closest point, or the foot, may be held fixed on its triangle.
@@ -207,7 +209,7 @@ class SurfaceDistance:
         """Displacements of the vertices from those of the nodes, (3v, 3m); None where they are the same."""
         return None if self._weights is None else csr_array(kron(self._weights, np.eye(3), format="csr"))
 
-    def expected(self, match: Match, noise: float) -> Floats:
+    def expected(self, match: Correspondence, noise: float) -> Floats:
         """Mean of the signed distances of points that noise has moved from where they were matched, (p,), metres.
 
         Noise leaves more points outside a round surface than inside: by sigma^2 H where the mean curvature H is small
@@ -252,18 +254,20 @@ def _normals(corners: Floats) -> tuple[Floats, Floats]:
     return normals / doubled[:, None], doubled
 
 
-def _to_planes(match: Match, corners: Floats, cloud: Floats, normals: Floats, doubled: Floats) -> Match:
+def _to_planes(
+    match: Correspondence, corners: Floats, cloud: Floats, normals: Floats, doubled: Floats
+) -> Correspondence:
     """The same match with distances to the planes of the triangles, but of points far beside their own."""
     first, second, arm = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], cloud - corners[:, 0]
-    feet = np.empty_like(match.weights)
-    feet[:, 1] = np.einsum("pi,pi->p", np.cross(arm, second), normals) / doubled
-    feet[:, 2] = np.einsum("pi,pi->p", np.cross(first, arm), normals) / doubled
-    feet[:, 0] = 1.0 - feet[:, 1] - feet[:, 2]
-    near = (feet > -_BESIDE).all(axis=1)
-    return Match(
+    closest_points = np.empty_like(match.weights)
+    closest_points[:, 1] = np.einsum("pi,pi->p", np.cross(arm, second), normals) / doubled
+    closest_points[:, 2] = np.einsum("pi,pi->p", np.cross(first, arm), normals) / doubled
+    closest_points[:, 0] = 1.0 - closest_points[:, 1] - closest_points[:, 2]
+    near = (closest_points > -_BESIDE).all(axis=1)
+    return Correspondence(
         np.where(near, -np.einsum("pi,pi->p", arm, normals), match.distances),
         np.where(near[:, None], normals, match.directions),
         match.triangles,
         match.weights,
-        np.where(near[:, None], feet, match.levers),
+        np.where(near[:, None], closest_points, match.levers),
     )

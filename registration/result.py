@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from .conditions import Estimate
 from .forward import State
-from .gauss_newton import LocalModel, Step
+from .gauss_newton import IterationRecord, LocalModel
 from .outcome import Outcome
+from .parameter_blocks import Estimate
 from .pose import Pose
 from .posterior import Posterior
 from .prepared import Prepared
-from .problem import Problem, Trial
+from .problem import Evaluation, Problem
 from .uncertainty import Uncertainty, uncertainty
 from .verdict import Judgement, Verdict
 
@@ -29,22 +29,22 @@ class Registration:
 
     Args:
         prepared: the forces' basis that its coefficients belong to.
-        trial: where the solver ended; the next frame starts there.
+        evaluation: where the solver ended; the next frame starts there.
         forces: nodal forces, (n, 3), newtons.
         state: the body's state as the model has it, with its derivatives.
         correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres; with
             it what a pose that was said to be known is off by.
-        doubt: how large the model's error was found, in units of its samples'; 1 where it is not known in patterns.
-        alike: so many points tell what one would that errs by itself; 1 where each does.
+        discrepancy_scale: factor found of the discrepancy's prior standard deviation; 1 where none is known.
+        inflation_factor: how many correlated residuals count as one; 1 where all are independent.
         pose: from the body's coordinates to the cloud's.
-        askew: what a pose that was said to be known is off by: a motion in the body's coordinates.
+        pose_correction: what a pose that was said to be known is off by: a motion in the body's coordinates.
         net_force: (3,), newtons.
         net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
         noise: standard deviation of a point's distance that was found, metres.
         force_scale: standard deviation of the force coefficients that was found, newtons.
         rms_distance: of the cloud to the registered surface, metres.
         outliers: share of the points that pulled nothing.
-        informed: directions of force and pose that the cloud told.
+        informed: number of likelihood-informed directions of force and pose.
         points: points that were used, after thinning.
         outcome: how the solver ended.
         judgement: whether the result can be used, and why not.
@@ -61,14 +61,14 @@ class Registration:
     """
 
     prepared: Prepared
-    trial: Trial
+    evaluation: Evaluation
     forces: Floats
     state: State
     correction: Floats
-    doubt: float
-    alike: float
+    discrepancy_scale: float
+    inflation_factor: float
     pose: Pose
-    askew: Pose
+    pose_correction: Pose
     net_force: Floats
     net_force_covariance: Floats
     noise: float
@@ -81,7 +81,7 @@ class Registration:
     judgement: Judgement
     evaluations: int
     seconds: float
-    trace: tuple[Step, ...]
+    trace: tuple[IterationRecord, ...]
     problem: Problem
     posterior: Posterior
     local: LocalModel | None = None
@@ -89,7 +89,7 @@ class Registration:
     unexplained: float = 0.0
     draft: Registration | None = None
 
-    def doubted(self, reason: str) -> Registration:
+    def with_reason(self, reason: str) -> Registration:
         """The same with a reason more to doubt it; what is refused stays so."""
         judged = self.judgement
         verdict = Verdict.DOUBTFUL if judged.is_usable else judged.verdict
@@ -98,12 +98,12 @@ class Registration:
     @property
     def coefficients(self) -> Floats:
         """Of forces, pose, conditions and model error, (k,)."""
-        return self.trial.coefficients
+        return self.evaluation.coefficients
 
     @cached_property
     def scatter(self) -> float:
         """Standard deviation of a point's distance with what neighbours share of its noise, metres."""
-        return float(np.sqrt(self.noise**2 + np.mean(self.problem.shared_noise(self.trial) ** 2)))
+        return float(np.sqrt(self.noise**2 + np.mean(self.problem.shared_noise(self.evaluation) ** 2)))
 
     @property
     def unknown_forces(self) -> Floats:
@@ -123,10 +123,10 @@ class Registration:
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:
         """What is known of stiffness and other unknowns beside the forces; none where there are none."""
-        conditions, part = self.problem.conditions, self.problem.condition_part
-        if conditions is None:
+        parameter_blocks, part = self.problem.parameter_blocks, self.problem.parameter_part
+        if parameter_blocks is None:
             return ()
-        return conditions.estimates(self.coefficients[part], self.posterior.covariance[part, part])
+        return parameter_blocks.estimates(self.coefficients[part], self.posterior.covariance[part, part])
 
     @cached_property
     def chance_of_pose(self) -> float:
@@ -144,15 +144,15 @@ class Registration:
 
         It is all that a state under nodal forces and fixed supports depends on. None where the modulus is no unknown.
         """
-        conditions, problem = self.problem.conditions, self.problem
-        unknown = None if conditions is None else conditions.modulus
-        if conditions is None or unknown is None:
+        parameter_blocks, problem = self.problem.parameter_blocks, self.problem
+        unknown = None if parameter_blocks is None else parameter_blocks.modulus
+        if parameter_blocks is None or unknown is None:
             return None
-        place, deviation = problem.condition_part.start + unknown[0], unknown[1]
+        place, deviation = problem.parameter_part.start + unknown[0], unknown[1]
         modulus = float(
-            np.mean(conditions.inputs(self.coefficients[problem.condition_part]).parameters["young_modulus"])
+            np.mean(parameter_blocks.inputs(self.coefficients[problem.parameter_part]).parameters["young_modulus"])
         )
-        slopes = problem.net_forces(self.trial) / modulus
+        slopes = problem.net_forces(self.evaluation) / modulus
         slopes[:, place] -= deviation * self.net_force / modulus
         covariance = self.posterior.net_force_covariance(slopes, problem.forces.left_out / modulus**2)
         return self.net_force / modulus, np.sqrt(np.diag(covariance))
@@ -164,7 +164,7 @@ class Registration:
         It holds for what the problem reckons with: noise, forces like those expected, the model's error where its
         patterns are known. Wrong stiffness, attachment or shape of the body are not among them.
         """
-        return uncertainty(self.problem, self.trial, self.posterior, self.prepared.unseen)
+        return uncertainty(self.problem, self.evaluation, self.posterior, self.prepared.unseen)
 
 
 def badness(result: Registration) -> tuple[int, float]:

@@ -274,7 +274,7 @@ def _spread_points(points: Floats, count: int) -> Ints:
     return np.array(chosen)
 
 
-def _distinct(shape: _Shape, motions: _Motions, misfits: Floats, apart: float, most: int) -> Ints:
+def _distinct(shape: _Shape, motions: _Motions, misfits: Floats, apart: float, maximum: int) -> Ints:
     """Numbers of the best motions that place the organ at different places, the best first."""
     order = np.argsort(misfits, kind="stable")
     seen = motions.back(shape.points[_spread_points(shape.points, 12)])
@@ -282,7 +282,7 @@ def _distinct(shape: _Shape, motions: _Motions, misfits: Floats, apart: float, m
     for i in order.tolist():
         if not kept or np.linalg.norm(seen[kept] - seen[i], axis=2).mean(axis=1).min() > apart:
             kept.append(i)
-        if len(kept) == most:
+        if len(kept) == maximum:
             break
     return np.array(kept)
 

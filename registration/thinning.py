@@ -14,7 +14,7 @@ _NEAR = 0.05  # of the cloud's extent: far more than noise, so that points in fr
 _THIN = 0.5  # of the lower quartile of the density: thinner places are favoured the less, outliers least of all
 
 
-def thinned(cloud: Floats, most: int) -> Ints:
+def thinned(cloud: Floats, maximum: int) -> Ints:
     """Numbers of points spread evenly over a cloud, at most so many, sorted.
 
     Points are drawn with a probability that falls with the density about them, systematically in space (after Stevens
@@ -24,24 +24,24 @@ def thinned(cloud: Floats, most: int) -> Ints:
 
     Args:
         cloud: points, (p, 3), metres.
-        most: most points wanted.
+        maximum: most points wanted.
 
     Raises:
-        ValueError: `most` is below 1.
+        ValueError: `maximum` is below 1.
     """
-    if most < 1:
-        raise ValueError(f"thinned.most: expected at least 1 point, got {most}.")
-    if len(cloud) <= most:
+    if maximum < 1:
+        raise ValueError(f"thinned.maximum: expected at least 1 point, got {maximum}.")
+    if len(cloud) <= maximum:
         return np.arange(len(cloud))
     chance = np.random.default_rng(0)
-    some = chance.permutation(len(cloud))[: _LOOKED_AT * most]
+    some = chance.permutation(len(cloud))[: _LOOKED_AT * maximum]
     seen = cloud[some]
     near = _NEAR * float(np.linalg.norm(np.ptp(seen, axis=0)))
     counts = 1 + cKDTree(seen[:_COUNTED]).query_ball_point(seen, near, return_length=True)
-    least = _THIN * np.quantile(counts, 0.25)
-    shares = np.minimum(counts / least, least / counts)
+    minimum = _THIN * np.quantile(counts, 0.25)
+    shares = np.minimum(counts / minimum, minimum / counts)
     # Every so-manieth share in an order in which neighbours follow each other: as likely, and evenly spread.
     order = cKDTree(seen).indices
     ends = np.cumsum(shares[order])
-    marks = (chance.uniform() + np.arange(most)) * ends[-1] / most
-    return np.unique(some[order[np.searchsorted(ends, marks)]])
+    landmarks = (chance.uniform() + np.arange(maximum)) * ends[-1] / maximum
+    return np.unique(some[order[np.searchsorted(ends, landmarks)]])

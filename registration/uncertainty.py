@@ -17,10 +17,10 @@ from scipy.stats import chi2
 
 from softtwin.meshes.embedding import Embedding
 
-from .forward import ConditionedState, ReducedModel
+from .forward import ParametrisedState, ReducedModel
 from .posterior import Posterior
-from .problem import Problem, Trial
-from .unknowns import Forces
+from .priors import NodalForces
+from .problem import Evaluation, Problem
 
 Floats = NDArray[np.float64]
 _DRAWN = 64  # combinations that stand for all directions that were left out
@@ -98,7 +98,7 @@ def _log_quantile(confidence: float) -> CubicSpline:
     return CubicSpline(freedom, np.log(chi2.ppf(confidence, freedom)))
 
 
-def unseen_response(model: ReducedModel, forces: Forces) -> Floats:
+def unseen_response(model: ReducedModel, forces: NodalForces) -> Floats:
     """Displacements at rest by the directions left out, for unit scale, (3n, r): a factor of their covariance.
 
     Where they are many, random combinations stand for them: a variance is known to a fifth.
@@ -113,26 +113,26 @@ def unseen_response(model: ReducedModel, forces: Forces) -> Floats:
     if directions.shape[1] > _DRAWN:
         chance = np.random.default_rng(0).standard_normal((directions.shape[1], _DRAWN))
         directions = directions @ (chance / np.sqrt(_DRAWN))
-    return np.asarray(model.solve(np.zeros(model.count)).full.push(directions))
+    return np.asarray(model.solve(np.zeros(model.count)).full.jvp(directions))
 
 
-def uncertainty(problem: Problem, trial: Trial, posterior: Posterior, unseen: Floats) -> Uncertainty:
+def uncertainty(problem: Problem, evaluation: Evaluation, posterior: Posterior, unseen: Floats) -> Uncertainty:
     """What is known of the displacement where a solver ended.
 
     Args:
         problem: what was registered.
-        trial: where.
+        evaluation: where.
         posterior: there.
         unseen: response to the directions of force that were left out, as from `unseen_response`.
     """
-    state = trial.state.full
-    blocks = [problem.growth(trial)[0] * state.push(problem.forces.basis)] if problem.forces.size else []
-    if problem.pose is not None and trial.pose is not None:
-        places = problem.observed.body.points + state.displacement + problem.correction(trial)
-        in_camera = problem.pose.jacobian(trial.coefficients[problem.pose_part], places)
-        blocks.append(np.einsum("ji,njk->nik", trial.pose.rotation, in_camera).reshape(-1, 6))
-    if problem.conditions is not None:
-        blocks.append(cast(ConditionedState, trial.state).by_conditions())
+    state = evaluation.state.full
+    blocks = [problem.stiffness_scaling(evaluation)[0] * state.jvp(problem.forces.basis)] if problem.forces.size else []
+    if problem.pose is not None and evaluation.pose is not None:
+        places = problem.observed.body.points + state.displacement + problem.correction(evaluation)
+        in_camera = problem.pose.jacobian(evaluation.coefficients[problem.pose_part], places)
+        blocks.append(np.einsum("ji,njk->nik", evaluation.pose.rotation, in_camera).reshape(-1, 6))
+    if problem.parameter_blocks is not None:
+        blocks.append(cast(ParametrisedState, evaluation.state).by_parameters())
     rest = np.zeros(len(problem.observed.body.points))
     if problem.error is not None:
         blocks.append(problem.error.size * problem.error.discrepancy.modes)

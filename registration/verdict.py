@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 
 from softtwin.meshes.metrics import displacement_gradients
 
-from .evidence import Scale
 from .forward import ForwardModel, State
-from .gauss_newton import Found
-from .identifiability import untold
+from .gauss_newton import SolverResult
+from .hyperparameters import LogNormalPrior
+from .identifiability import uninformed
 from .outcome import Outcome
 from .problem import Problem
 
@@ -65,14 +65,15 @@ class Expectations:
         systematic: largest part of it that neighbouring points share, metres: noise is shared by none.
         movement: largest displacement of a node, metres; nothing is known of larger ones.
         outliers: largest share of points that may be wrong.
-        extent: largest load relative to what the model has learned.
+        extrapolation_ratio: largest load relative to what the model has learned.
         informed: fewest directions that a cloud must tell, where so many are unknown.
         pose: largest move of the pose in deviations of its prior.
-        condition: the same of stiffness and other unknowns beside the forces.
+        parameter: the same of stiffness and other unknowns beside the forces.
         gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
-        doubt: how often as large as it was seen to be what the model gets wrong may be taken.
+        discrepancy_scale: how often as large as it was seen to be what the model gets wrong may be taken.
         correction: however large beside what was seen, so little of it harms nobody: of an observed node, metres.
-        told: least part of the variance of such an unknown, and of every combination of them, that a cloud must take
+        minimum_variance_reduction: part of the variance of such a parameter, and of every combination of them, that a
+            cloud must take
             away where all forces are known.
     """
 
@@ -80,17 +81,17 @@ class Expectations:
     systematic: float
     movement: float
     outliers: float = 0.4
-    extent: float = 1.2
+    extrapolation_ratio: float = 1.2
     informed: float = 2.0
     pose: float = 3.0
-    condition: float = 3.0
-    doubt: float = 2.0
+    parameter: float = 3.0
+    discrepancy_scale: float = 2.0
     correction: float = 0.0
-    told: float = 0.5
+    minimum_variance_reduction: float = 0.5
     gradient: float = np.inf
 
     @classmethod
-    def of(cls, model: ForwardModel, noise: Scale) -> Expectations:
+    def of(cls, model: ForwardModel, noise: LogNormalPrior) -> Expectations:
         """By the size of the model's body and the noise that is expected.
 
         Args:
@@ -110,7 +111,9 @@ class Expectations:
 _Finding = tuple[Verdict, str]
 
 
-def judge(problem: Problem, found: Found, state: State, expected: Expectations, doubt: float = 1.0) -> Judgement:
+def judge(
+    problem: Problem, found: SolverResult, state: State, expected: Expectations, discrepancy_scale: float = 1.0
+) -> Judgement:
     """The verdict on a solver's result.
 
     Args:
@@ -118,14 +121,14 @@ def judge(problem: Problem, found: Found, state: State, expected: Expectations, 
         found: where the solver ended.
         state: the body's state there.
         expected: what a usable result looks like.
-        doubt: how large the model's error was found, in units of its samples'.
+        discrepancy_scale: how large the model's error was found, in units of its samples'.
     """
     findings = [
         *_of_the_search(found),
         *_of_the_cloud(problem, found, expected),
         *_of_the_fit(problem, found, expected),
         *_of_the_state(problem, state, expected),
-        *_of_the_error(problem, found, expected, doubt),
+        *_of_the_error(problem, found, expected, discrepancy_scale),
         *_of_the_pose(problem, found, expected),
         *_of_the_conditions(problem, found, expected),
         *_of_the_marks(problem, found),
@@ -140,13 +143,13 @@ def judge(problem: Problem, found: Found, state: State, expected: Expectations, 
     return Judgement(worst, tuple(reason for _, reason in findings))
 
 
-def _of_the_search(found: Found) -> list[_Finding]:
+def _of_the_search(found: SolverResult) -> list[_Finding]:
     if found.outcome is Outcome.CONVERGED:
         return []
     return [(Verdict.DOUBTFUL, f"not converged: {found.outcome.value}; {found.outcome.advice}")]
 
 
-def _of_the_cloud(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
+def _of_the_cloud(problem: Problem, found: SolverResult, expected: Expectations) -> list[_Finding]:
     cloud, findings = problem.cloud, []
     spread = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False) / np.sqrt(len(cloud))
     if len(cloud) < _FEWEST_POINTS:
@@ -162,9 +165,9 @@ def _of_the_cloud(problem: Problem, found: Found, expected: Expectations) -> lis
     return findings
 
 
-def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
-    match, findings = found.trial.match, list[_Finding]()
-    by_patches = problem.shared_noise(found.trial)
+def _of_the_fit(problem: Problem, found: SolverResult, expected: Expectations) -> list[_Finding]:
+    match, findings = found.evaluation.match, list[_Finding]()
+    by_patches = problem.shared_noise(found.evaluation)
     noise = float(np.hypot(found.posterior.scales.noise, np.sqrt(np.mean(by_patches**2))))
     if noise > expected.noise:
         verdict = Verdict.REFUSED if noise > 1.5 * expected.noise else Verdict.DOUBTFUL
@@ -174,7 +177,7 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
         )  # fmt: skip
     systematic = noise  # of which neighbours share a part
     if systematic > expected.systematic:
-        systematic *= np.sqrt(shared(problem.observed.feet(match), match.distances, found.weights))
+        systematic *= np.sqrt(shared(problem.observed.closest_points(match), match.distances, found.weights))
     if systematic > expected.systematic:
         verdict = Verdict.REFUSED if systematic > 2.0 * expected.systematic else Verdict.DOUBTFUL
         findings.append(
@@ -184,7 +187,7 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
     outliers = float(np.mean(found.weights < 0.05))
     if outliers > expected.outliers:
         findings.append((Verdict.DOUBTFUL, f"{100 * outliers:.0f} % of the points fit nowhere"))
-    elif outliers > _MUCH and thickness(found.trial.cloud[found.weights < 0.05]) < _THIN:
+    elif outliers > _MUCH and thickness(found.evaluation.cloud[found.weights < 0.05]) < _THIN:
         findings.append(
             (Verdict.DOUBTFUL, f"{100 * outliers:.0f} % of the points are a surface that is none of this organ's: "
                                "something else is in the cloud")
@@ -192,27 +195,27 @@ def _of_the_fit(problem: Problem, found: Found, expected: Expectations) -> list[
     return findings
 
 
-def _of_the_marks(problem: Problem, found: Found) -> list[_Finding]:
+def _of_the_marks(problem: Problem, found: SolverResult) -> list[_Finding]:
     """Landmarks that lie far from where they were found: one was taken for another, or the state is another."""
-    if problem.marks is None:
+    if problem.landmarks is None:
         return []
-    off = np.linalg.norm(problem.mark_residuals(found.trial).reshape(-1, 3), axis=1)
+    off = np.linalg.norm(problem.landmark_residuals(found.evaluation).reshape(-1, 3), axis=1)
     if off.max() <= _MARK_OFF:
         return []
-    away = 1e3 * problem.marks.deviation * off.max()
+    away = 1e3 * problem.landmarks.deviation * off.max()
     return [(Verdict.DOUBTFUL, f"landmark {int(off.argmax())} lies {away:.1f} mm from where it was found")]
 
 
-def shared(feet: Floats, distances: Floats, weights: Floats) -> float:
+def shared(closest_points: Floats, distances: Floats, weights: Floats) -> float:
     """Part of the variance of the distances that a point shares with its neighbours, between 0 and 1.
 
     Args:
-        feet: places of the points on the surface at rest, (p, 3), metres; in space, noise sorts points by sign.
+        closest_points: on the undeformed surface, (p, 3), metres; in space, noise sorts points by sign.
         distances: signed, (p,), metres.
         weights: of the points, (p,); those without weight are left out.
     """
     kept = weights > 0.05
-    points, values = feet[kept], distances[kept]
+    points, values = closest_points[kept], distances[kept]
     count = min(_NEIGHBOURS, len(points) - 1)
     if count < 1 or not values.any():
         return 0.0
@@ -238,14 +241,17 @@ def thickness(points: Floats) -> float:
     return float(np.median(squares[:, 2] / np.maximum(squares.sum(axis=1), 1e-300)))
 
 
-def _of_the_normals(problem: Problem, found: Found) -> list[_Finding]:
+def _of_the_normals(problem: Problem, found: SolverResult) -> list[_Finding]:
     """Normals that are none of this surface's: of another frame, say, or columns of something else."""
-    if problem.across is None:
+    if problem.tangent_basis is None:
         return []
-    known = np.abs(problem.across).max(axis=(1, 2)) > 0.0
-    leaning = np.linalg.norm(problem.normal_residuals(found.trial).reshape(-1, 2)[known], axis=1) * problem.leaning
+    known = np.abs(problem.tangent_basis).max(axis=(1, 2)) > 0.0
+    leaning = (
+        np.linalg.norm(problem.normal_residuals(found.evaluation).reshape(-1, 2)[known], axis=1)
+        * problem.normal_deviation
+    )
     median = float(np.rad2deg(np.arcsin(np.minimum(np.median(leaning), 1.0))))
-    expected = float(np.rad2deg(np.sqrt(2.0 * np.log(2.0)) * problem.leaning))  # Rayleigh's law
+    expected = float(np.rad2deg(np.sqrt(2.0 * np.log(2.0)) * problem.normal_deviation))  # Rayleigh's law
     if median <= _LEANING * expected:
         return []
     return [
@@ -264,74 +270,80 @@ def _of_the_state(problem: Problem, state: State, expected: Expectations) -> lis
         )  # fmt: skip
     if expected.gradient < np.inf:
         gradients = displacement_gradients(problem.observed.body, state.displacement)
-        most = float(np.percentile(np.linalg.norm(gradients, ord=2, axis=(1, 2)), _NEARLY_ALL))
-        if most > expected.gradient:
+        maximum = float(np.percentile(np.linalg.norm(gradients, ord=2, axis=(1, 2)), _NEARLY_ALL))
+        if maximum > expected.gradient:
             findings.append(
-                (Verdict.DOUBTFUL, f"parts of the organ turn or stretch by {100 * most:.0f} %; its law is linear, "
+                (Verdict.DOUBTFUL, f"parts of the organ turn or stretch by {100 * maximum:.0f} %; its law is linear, "
                                    f"which holds up to {100 * expected.gradient:.0f} %")
             )  # fmt: skip
-    extent = state.extent
-    if extent is not None and extent > expected.extent:
-        verdict = Verdict.REFUSED if extent > 2.0 * expected.extent else Verdict.DOUBTFUL
-        findings.append((verdict, f"the load is {extent:.1f} times the largest that the surrogate has learned"))
+    extrapolation_ratio = state.extrapolation_ratio
+    if extrapolation_ratio is not None and extrapolation_ratio > expected.extrapolation_ratio:
+        verdict = Verdict.REFUSED if extrapolation_ratio > 2.0 * expected.extrapolation_ratio else Verdict.DOUBTFUL
+        findings.append(
+            (verdict, f"the load is {extrapolation_ratio:.1f} times the largest that the surrogate has learned")
+        )
     pivots = state.negative_pivots
     if pivots:
         findings.append((Verdict.DOUBTFUL, f"the state is unstable: {pivots} negative pivots of its tangent"))
     return findings
 
 
-def _of_the_error(problem: Problem, found: Found, expected: Expectations, doubt: float) -> list[_Finding]:
+def _of_the_error(
+    problem: Problem, found: SolverResult, expected: Expectations, discrepancy_scale: float
+) -> list[_Finding]:
     """What no state explains goes into what the model gets wrong: more of that than was seen is none of it."""
-    if doubt <= expected.doubt:
+    if discrepancy_scale <= expected.discrepancy_scale:
         return []
-    correction = problem.correction(found.trial)[problem.observed.nodes]
+    correction = problem.correction(found.evaluation)[problem.observed.nodes]
     size = float(np.sqrt((correction**2).sum(axis=1).mean()))
     if size <= expected.correction:
         return []
     return [
-        (Verdict.DOUBTFUL, f"the cloud asks for {doubt:.1f} times what the model was seen to get wrong, "
+        (Verdict.DOUBTFUL, f"the cloud asks for {discrepancy_scale:.1f} times what the model was seen to get wrong, "
                            f"{1e3 * size:.1f} mm: some of it shows no state of this organ, or the organ is not as it "
                            "was taken for")
     ]  # fmt: skip
 
 
-def _of_the_pose(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
+def _of_the_pose(problem: Problem, found: SolverResult, expected: Expectations) -> list[_Finding]:
     if problem.pose is None:
         return []
-    largest = float(np.abs(found.trial.coefficients[problem.pose_part]).max())
+    largest = float(np.abs(found.evaluation.coefficients[problem.pose_part]).max())
     if largest <= expected.pose:
         return []
     advice = "say --pose unknown" if problem.pose.is_said else "give a better start"
     return [(Verdict.DOUBTFUL, f"the pose lies {largest:.1f} deviations from where it was expected; {advice}")]
 
 
-def _of_the_conditions(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
+def _of_the_conditions(problem: Problem, found: SolverResult, expected: Expectations) -> list[_Finding]:
     """Unknowns far from where they were expected, and those that the cloud says nothing of.
 
     With unknown forces the latter is no fault: the prior of the stiffness is what the newtons are worth. Nor is it one
     of a contact, which only its place along the surface tells.
     """
-    if problem.conditions is None:
+    if problem.parameter_blocks is None:
         return []
-    is_asked_for = not problem.forces.size and not problem.conditions.has_forces_alone
-    part, findings = problem.condition_part, list[_Finding]()
-    for known in problem.conditions.estimates(found.trial.coefficients[part], found.posterior.covariance[part, part]):
-        if known.deviations > expected.condition:
+    is_asked_for = not problem.forces.size and not problem.parameter_blocks.has_forces_alone
+    part, findings = problem.parameter_part, list[_Finding]()
+    for known in problem.parameter_blocks.estimates(
+        found.evaluation.coefficients[part], found.posterior.covariance[part, part]
+    ):
+        if known.deviations > expected.parameter:
             findings.append(
                 (Verdict.DOUBTFUL, f"{known.name} lies {known.deviations:.1f} deviations from where it was expected")
             )
     return findings + (_of_what_is_untold(problem, found, expected) if is_asked_for else [])
 
 
-def _of_what_is_untold(problem: Problem, found: Found, expected: Expectations) -> list[_Finding]:
+def _of_what_is_untold(problem: Problem, found: SolverResult, expected: Expectations) -> list[_Finding]:
     """Unknowns, and combinations of them, of which the cloud has left most of what was believed beforehand."""
-    conditions, part = problem.conditions, problem.condition_part
-    assert conditions is not None
+    parameter_blocks, part = problem.parameter_blocks, problem.parameter_part
+    assert parameter_blocks is not None
     covariance = found.posterior.covariance[part, part]
-    names = [known.name for known in conditions.estimates(found.trial.coefficients[part], covariance)]
-    if conditions.has_regions:
+    names = [known.name for known in parameter_blocks.estimates(found.evaluation.coefficients[part], covariance)]
+    if parameter_blocks.has_regions:
         names = [f"{name} of the rest" if name == "Young's modulus" else name for name in names]
-    alone, combined = untold(conditions, names, covariance, expected.told)
+    alone, combined = uninformed(parameter_blocks, names, covariance, expected.minimum_variance_reduction)
     given = "what is given is what was expected beforehand"
     same = "other values that differ so would explain it as well"
     return [

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from .error_indicators import IndicatorReader
 from .model import Surrogate
-from .signs import SignReader
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -17,10 +17,10 @@ _AS_DRAWN = 0.5  # of those that are taken: a network that learns from ever more
 _LEAST_SPREAD = 1e-3  # of the largest: a direction hardly ever loaded must not tell loads apart
 
 
-def most_telling(surrogate: Surrogate, candidates: Iterable[Floats], wanted: int, known: Floats) -> Ints:
+def most_informative(surrogate: Surrogate, candidates: Iterable[Floats], wanted: int, known: Floats) -> Ints:
     """Places of the candidates that tell a network most.
 
-    Of the loads whose predictions have the longest linear step to balance (`Signs.step`; one that is inside out counts
+    Of the loads whose predictions have the longest linear step to balance (`ErrorIndicators.step`; inverted ones count
     as infinitely far) those are taken that lie far from what is known and from each other in the network's
     coordinates (farthest-point sampling, Gonzalez 1985). Every second one is the next candidate as they come, so that
     what is learned keeps to how loads are drawn.
@@ -38,18 +38,18 @@ def most_telling(surrogate: Surrogate, candidates: Iterable[Floats], wanted: int
         CalibrationError: the card does not name a material that torch knows.
         ValueError: fewer candidates than are wanted.
     """
-    reader = SignReader(surrogate)
+    reader = IndicatorReader(surrogate)
     steps, coordinates = [], []
     for ramp in candidates:
         found = [reader.read(forces, surrogate.solve(forces)).step for forces in ramp]
         worst = int(np.argmax(found))
         steps.append(found[worst])
-        coordinates.append(surrogate.maps.encoded(ramp[worst].ravel()[surrogate.rows]))
+        coordinates.append(surrogate.encoder_decoder.encoded(ramp[worst].ravel()[surrogate.rows]))
     if len(steps) < wanted:
         raise ValueError(f"most_telling.candidates: expected at least {wanted}, got {len(steps)}.")
     telling = wanted - int(_AS_DRAWN * wanted)
     short = np.argsort(-np.asarray(steps), kind="stable")[: _SHORT_LIST * telling]
-    learned = surrogate.maps.encoded(known.reshape(len(known), -1).T).T
+    learned = surrogate.encoder_decoder.encoded(known.reshape(len(known), -1).T).T
     spread = np.sqrt((learned**2).mean(axis=0))
     spread = np.maximum(spread, _LEAST_SPREAD * spread.max())
     told = short[spread_out(np.stack(coordinates)[short] / spread, telling, learned / spread)]

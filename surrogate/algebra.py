@@ -11,12 +11,12 @@ class TorchAlgebra:
 
     Args:
         like: a tensor of the precision and on the device wanted.
-        least: determinants below it are given as a^2 / (2 a - det) with a = least, which is positive and joins
+        minimum: determinants below it are given as a^2 / (2 a - det) with a = least, which is positive and joins
             smoothly, so that energies of what is inside out are finite; 0 leaves them as they are.
     """
 
-    def __init__(self, like: Tensor, least: float = 0.0) -> None:
-        self.like, self.least = like, least
+    def __init__(self, like: Tensor, minimum: float = 0.0) -> None:
+        self.like, self.minimum = like, minimum
 
     def Identity(self, size: int) -> Tensor:  # noqa: N802 - UFL's name
         """The unit tensor."""
@@ -41,9 +41,11 @@ class TorchAlgebra:
     def det(self, A: Tensor) -> Tensor:
         """The determinant of 3 x 3."""
         found = (A[..., 0, :] * torch.linalg.cross(A[..., 1, :], A[..., 2, :])).sum(dim=-1)
-        if not self.least:
+        if not self.minimum:
             return found
-        return torch.where(found < self.least, self.least**2 / (2 * self.least - found.clamp_max(self.least)), found)
+        return torch.where(
+            found < self.minimum, self.minimum**2 / (2 * self.minimum - found.clamp_max(self.minimum)), found
+        )
 
     def inner(self, A: Tensor, B: Tensor) -> Tensor:
         """A : B."""

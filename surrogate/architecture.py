@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples
 
-from .maps import LinearMaps
+from .encoder_decoder import LinearEncoderDecoder
 
 _AT_ONCE = 64  # tangents: a thousand through the grids of a U-Net would take 20 GB
 
@@ -24,10 +24,10 @@ class Linearisation(Protocol):
     def values(self) -> Tensor:
         """(e,)."""
 
-    def push(self, tangents: Tensor) -> Tensor:
+    def jvp(self, tangents: Tensor) -> Tensor:
         """Changes of the values, (e, k), for changes of the coordinates, (d, k)."""
 
-    def pull(self, cotangent: Tensor) -> Tensor:
+    def vjp(self, cotangent: Tensor) -> Tensor:
         """Gradient with respect to the coordinates, (d,), for one with respect to the values, (e,)."""
 
 
@@ -58,7 +58,7 @@ class Differentiated:
         """(e,)."""
         return self._value(self.coordinates)
 
-    def push(self, tangents: Tensor) -> Tensor:
+    def jvp(self, tangents: Tensor) -> Tensor:
         """Changes of the values, (e, k), for changes of the coordinates, (d, k)."""
 
         def one(tangent: Tensor) -> Tensor:
@@ -66,7 +66,7 @@ class Differentiated:
 
         return torch.func.vmap(one, in_dims=1, out_dims=1, chunk_size=_AT_ONCE)(tangents)
 
-    def pull(self, cotangent: Tensor) -> Tensor:
+    def vjp(self, cotangent: Tensor) -> Tensor:
         """Gradient with respect to the coordinates, (d,), for one with respect to the values, (e,)."""
         gradient: Tensor = torch.func.vjp(self._value, self.coordinates)[1](cotangent)[0]
         return gradient
@@ -76,7 +76,7 @@ class Differentiated:
         return values
 
 
-class Lesson(Protocol):
+class TrainingObjective(Protocol):
     """A network in training, with its data: a module, since its data move to the device with it."""
 
     network: nn.Module
@@ -101,7 +101,7 @@ class Lesson(Protocol):
     def error(self) -> float:
         """Error over the validation samples: the weights with the least are kept."""
 
-    def maps(self) -> LinearMaps:
+    def encoder_decoder(self) -> LinearEncoderDecoder:
         """The linear maps around the network."""
 
     def trained(self) -> Network:
@@ -124,12 +124,12 @@ class Architecture(Protocol):
             ValueError: what is wrong with the body.
         """
 
-    def lesson(self, data: DataSet, train: Samples, validation: Samples) -> Any:
-        """A `Lesson` with fresh weights."""
+    def objective(self, data: DataSet, train: Samples, validation: Samples) -> Any:
+        """A `TrainingObjective` with fresh weights."""
 
     def optimizer(self, network: Any, rate: float) -> torch.optim.Optimizer:
         """What trains the lesson's network; its rate is set before every step."""
 
     @staticmethod
-    def revived(tensors: Mapping[str, Tensor]) -> Network:
+    def from_state_dict(tensors: Mapping[str, Tensor]) -> Network:
         """The predicting network from what its `state_dict` was."""

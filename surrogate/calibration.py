@@ -20,13 +20,13 @@ from scipy.stats import spearmanr
 from softtwin.meshes.metrics import nodal_distances
 from softtwin.reference.data.dataset import DataSet, Samples, Split, stored_plans
 
-from .certificate import ERRORS, Certifier, range_of
+from .error_bound import ERRORS, ErrorEstimator, range_of
+from .error_indicators import CalibrationError, Error, ErrorIndicators, IndicatorReader
 from .model import Surrogate
-from .signs import CalibrationError, Error, SignReader, Signs
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Seen = tuple[list[Signs], dict[str, Floats]]  # signs of predictions and true errors, metres, by kind
+Seen = tuple[list[ErrorIndicators], dict[str, Floats]]  # signs of predictions and true errors, metres, by kind
 _A_RANGE = 50  # calibration samples that a range of its own should have
 _RANGES = 4  # of size, at most
 _USUAL = 0.99  # of the calibration samples: who is farther out of balance is set aside
@@ -86,7 +86,7 @@ def calibrate(
             "of size make the bound one to go by."
         )
     _compare_loads(surrogate, data, split)
-    reader = SignReader(surrogate)
+    reader = IndicatorReader(surrogate)
     shown, errors = read_samples(reader, data, held)
     shown_before, errors_before = read_samples(reader, data, fitted)
     entry = {
@@ -94,7 +94,7 @@ def calibrate(
         "split": split,
         **fitted_bounds((shown_before, errors_before), (shown, errors), paths, confidence),
         "limits": {
-            name: _limit([getattr(signs, name) for signs in shown], share)
+            name: _limit([getattr(indicators, name) for indicators in shown], share)
             for name, share in (("size", 1.0), ("residual", _USUAL), ("step", _USUAL))
         },
     }
@@ -119,13 +119,13 @@ def fitted_bounds(before: Seen, seen: Seen, paths: Ints, confidence: float) -> d
     """
     shown, errors = seen
     powers = {error: _fitted(before[0], before[1], error, confidence) for error in ERRORS}
-    count, sizes = len(np.unique(paths)), np.array([signs.size for signs in shown])
+    count, sizes = len(np.unique(paths)), np.array([indicators.size for indicators in shown])
     edges = np.quantile(sizes, np.linspace(0.0, 1.0, max(1, min(_RANGES, count // _A_RANGE)) + 1))[1:-1]
     places = np.searchsorted(edges, sizes, side="right")
-    ranks = {error: np.stack([signs.row(error) for signs in shown]) @ powers[error] for error in ERRORS}
+    ranks = {error: np.stack([indicators.row(error) for indicators in shown]) @ powers[error] for error in ERRORS}
     with np.errstate(over="ignore"):
         scores = {error: errors[error] / np.exp(ranks[error]) for error in ERRORS}
-    lost = ~np.array([signs.is_finite for signs in shown])
+    lost = ~np.array([indicators.is_finite for indicators in shown])
     members = [places == place for place in range(len(edges) + 1)]
     for values in scores.values():
         values[lost] = 0.0  # without signs the bound is infinite, which any error keeps
@@ -147,7 +147,7 @@ def _first(samples: Samples, count: int) -> Samples:
     return Samples(**{field.name: getattr(samples, field.name)[:count] for field in fields(samples)})
 
 
-def read_samples(reader: SignReader, data: DataSet, samples: Samples, newton: bool = False) -> Seen:
+def read_samples(reader: IndicatorReader, data: DataSet, samples: Samples, newton: bool = False) -> Seen:
     """Signs of the predictions of samples, and their true errors, metres, (s,) each.
 
     Args:
@@ -179,7 +179,7 @@ class Coverage:
         widths: median bound over median error in each range, likewise; None too where most have no bound.
         in_range: samples in each range.
         rank_correlation: Spearman's, of bound and error; None where they do not vary.
-        step_correlation: the same of eta, the linear step towards balance (`Signs.step`), alone.
+        step_correlation: the same of eta, the linear step towards balance (`ErrorIndicators.step`), alone.
         outside: samples that the certificate sets aside; they count in all of the above.
         newton: whether the bounds are read from steps of Newton's method.
         unstable: predictions whose tangent has negative pivots; None where no such step was made.
@@ -231,13 +231,13 @@ def coverage(
         CalibrationError: there is no certificate, or none of such steps.
         DataSetError: the split is not complete.
     """
-    certifier = Certifier(surrogate)
-    shown, errors = read_samples(certifier.reader, data, data.samples(split, limit), newton)
-    given = [certifier.read(signs) for signs in shown]
+    estimator = ErrorEstimator(surrogate)
+    shown, errors = read_samples(estimator.reader, data, data.samples(split, limit), newton)
+    given = [estimator.read(indicators) for indicators in shown]
     bounds = {error: np.array([getattr(each, error) for each in given]) for error in ERRORS}
-    eta = np.array([signs.step for signs in shown])
+    eta = np.array([indicators.step for indicators in shown])
     known = surrogate.card["certificate"]["newton"] if newton else surrogate.card["certificate"]
-    places = np.array([range_of(known, signs) for signs in shown])
+    places = np.array([range_of(known, indicators) for indicators in shown])
     members = [places == place for place in range(len(known["edges"]) + 1)]
     kept = {error: errors[error] <= bounds[error] for error in ERRORS}
     return Coverage(
@@ -294,14 +294,14 @@ def _ways(plans: list[dict[str, Any]]) -> list[dict[str, Any] | None]:
     return [{**plan["loads"], "ramp": plan.get("ramp", 1)} if plan.get("loads") else None for plan in plans]
 
 
-def _fitted(shown: list[Signs], found: dict[str, Floats], error: Error, confidence: float) -> Floats:
+def _fitted(shown: list[ErrorIndicators], found: dict[str, Floats], error: Error, confidence: float) -> Floats:
     """Intercept and powers of the signs whose product such a share of errors stays below: quantile regression.
 
     Least squares would follow the few predictions that are far from any equilibrium, whose steps mean little: bounds by
     a Newton step were a quarter wider (beam under modal loads).
     """
-    errors, rows = found[error], np.stack([signs.row(error) for signs in shown])
-    usable = np.array([signs.is_finite for signs in shown]) & (errors > 0.0)
+    errors, rows = found[error], np.stack([indicators.row(error) for indicators in shown])
+    usable = np.array([indicators.is_finite for indicators in shown]) & (errors > 0.0)
     if not usable.any():
         return np.eye(rows.shape[1])[-1]
     return _quantile_regression(rows[usable, 1:], np.log(errors[usable]), confidence)
@@ -325,7 +325,7 @@ def _quantile_regression(rows: Floats, values: Floats, share: float) -> Floats:
     return np.concatenate([[solved.x[0] - slopes @ centre], slopes])
 
 
-def _usual_load(before: list[Signs], seen: list[Signs], confidence: float) -> dict[str, Any]:
+def _usual_load(before: list[ErrorIndicators], seen: list[ErrorIndicators], confidence: float) -> dict[str, Any]:
     """How far out loads lie among those on their nodes, by the number of components that they act on.
 
     Args:
@@ -337,8 +337,8 @@ def _usual_load(before: list[Signs], seen: list[Signs], confidence: float) -> di
         `powers` of the logarithm of the number, the highest first, and `limit` of what they leave of the distance's.
     """
 
-    def told(signs: list[Signs]) -> tuple[Floats, Floats]:
-        given = np.array([each.load for each in signs if each.load is not None and each.load[1]], dtype=np.float64)
+    def told(indicators: list[ErrorIndicators]) -> tuple[Floats, Floats]:
+        given = np.array([each.load for each in indicators if each.load is not None and each.load[1]], dtype=np.float64)
         distances, counts = given.reshape(-1, 2).T
         return np.log(np.maximum(distances, 1e-300)), np.log(np.maximum(counts, 1.0))
 

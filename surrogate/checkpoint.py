@@ -36,7 +36,7 @@ def fingerprint(data: DataSet, splits: Mapping[str, Samples]) -> str:
 
 
 def read_checkpoint(path: Path, plan: TrainingPlan, mark: str) -> dict[str, Any]:
-    """What `Course.take_back` goes on from.
+    """What `TrainingModule.take_back` goes on from.
 
     Args:
         path: of the checkpoint.
@@ -47,30 +47,30 @@ def read_checkpoint(path: Path, plan: TrainingPlan, mark: str) -> dict[str, Any]
         CheckpointError: it is truncated, or of another version of this program, plan or data set.
     """
     try:
-        course: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)["course"]
-        if "steps_made" not in course:
+        training_module: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)["course"]
+        if "steps_made" not in training_module:
             raise KeyError("steps_made")
     except Exception as error:  # a damaged file fails in whichever layer reads it: zip, pickle, or the keys
         raise CheckpointError(
             f"train.folder: {path} cannot be read ({type(error).__name__}); it is truncated or no checkpoint of "
             "this program. Delete it to train from the start."
         ) from error
-    if course.get("version", 1) != VERSION:
+    if training_module.get("version", 1) != VERSION:
         raise CheckpointError(
             f"train.folder: {path} is of another version of this program, which trains in another way; choose another "
             "folder, or train from the start (`softtwin train --fresh`)."
         )
     wanted, usual = plan.entries(), TrainingPlan(type(plan.architecture)()).entries()
-    stored = {**usual, **course["plan"]}  # a setting that is newer than the checkpoint was as usual
+    stored = {**usual, **training_module["plan"]}  # a setting that is newer than the checkpoint was as usual
     differing = [name for name in wanted if stored[name] != wanted[name]]
     if differing:
         raise CheckpointError(
             f"train.folder: {path} belongs to another plan (differs in {', '.join(differing)}); choose another folder, "
             "the plan it was made with to go on, or train from the start (`softtwin train --fresh`)."
         )
-    if course["data"] != mark:
+    if training_module["data"] != mark:
         raise CheckpointError(
             f"train.folder: {path} belongs to another data set; choose another folder, or train "
             "from the start (`softtwin train --fresh`)."
         )
-    return course
+    return training_module

@@ -35,7 +35,7 @@ def relative_errors(surrogate: Surrogate, data: DataSet, samples: Samples) -> Fl
     return missing
 
 
-def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 32) -> Surrogate:
+def with_discrepancy(surrogate: Surrogate, data: DataSet, maximum: int = 32) -> Surrogate:
     """The surrogate with the patterns of its errors on the validation samples: see `discrepancy_of`.
 
     Of fewer than four samples nothing is learned: the surrogate stays as it is.
@@ -43,12 +43,12 @@ def with_discrepancy(surrogate: Surrogate, data: DataSet, most: int = 32) -> Sur
     Args:
         surrogate: the surrogate.
         data: the data set that it was trained on.
-        most: most patterns kept.
+        maximum: most patterns kept.
     """
     samples = data.samples("validation")
     if len(samples) < _LEAST:
         return surrogate
-    found, bounded = discrepancy_of(relative_errors(surrogate, data, samples), data.body, most, _BOUND)
+    found, bounded = discrepancy_of(relative_errors(surrogate, data, samples), data.body, maximum, _BOUND)
     entry = {"samples": len(samples), "bounded": bounded}
     return _with(surrogate, found, entry)
 
@@ -65,6 +65,6 @@ def beside(surrogate: Surrogate, further: Discrepancy) -> Surrogate:
 
 
 def _with(surrogate: Surrogate, found: Discrepancy, entry: Mapping[str, float]) -> Surrogate:
-    maps = replace(surrogate.maps, error_modes=found.modes, error_rest=found.rest)
+    encoder_decoder = replace(surrogate.encoder_decoder, error_modes=found.modes, error_rest=found.rest)
     card = {**surrogate.card, "discrepancy": {**entry, "places": found.places}}
-    return Surrogate(surrogate.body, maps, surrogate.network, card)
+    return Surrogate(surrogate.body, encoder_decoder, surrogate.network, card)

@@ -18,25 +18,25 @@ _LEAST_REST = 1e-3  # of the mean square of a component
 
 
 def with_domain(surrogate: Surrogate, data: DataSet) -> Surrogate:
-    """The surrogate with the extent of its training loads: `SurrogateState.extent` is 1 at the farthest of them.
+    """The surrogate with the range of its training loads: the extrapolation ratio is 1 at the farthest of them.
 
     The measure is the root mean square of the network's coordinates, each in units of its spread over training. What
-    the coordinates do not see is told by how the loads spread over the nodes (`LinearMaps.load_modes`).
+    the coordinates do not see is told by how the loads spread over the nodes (`LinearEncoderDecoder.load_modes`).
 
     Args:
         surrogate: the surrogate.
         data: the data set that it was trained on.
     """
     samples = data.samples("train")
-    coordinates = surrogate.maps.encoded(samples.forces.reshape(len(samples), -1).T).T
+    coordinates = surrogate.encoder_decoder.encoded(samples.forces.reshape(len(samples), -1).T).T
     spread = np.sqrt((coordinates**2).mean(axis=0))
     spread = np.maximum(spread, _LEAST_SPREAD * spread.max())
     reach = np.sqrt(((coordinates / spread) ** 2).mean(axis=1)).max()
     largest = np.linalg.norm(samples.displacements, axis=2).max()
     domain = {"reach": float(reach), "displacement_m": float(largest)}
     modes, rest = _load_modes(samples.forces.reshape(len(samples), -1))
-    maps = replace(surrogate.maps, spread=spread, load_modes=modes, load_rest=rest)
-    return Surrogate(surrogate.body, maps, surrogate.network, {**surrogate.card, "domain": domain})
+    encoder_decoder = replace(surrogate.encoder_decoder, spread=spread, load_modes=modes, load_rest=rest)
+    return Surrogate(surrogate.body, encoder_decoder, surrogate.network, {**surrogate.card, "domain": domain})
 
 
 def _load_modes(loads: Floats) -> tuple[Floats, Floats]:
@@ -58,14 +58,14 @@ def load_distance(surrogate: Surrogate, forces: Floats) -> tuple[float, int] | N
         surrogate: the surrogate.
         forces: (n, 3), newtons.
     """
-    maps = surrogate.maps
-    if maps.load_modes is None or maps.load_rest is None:
+    encoder_decoder = surrogate.encoder_decoder
+    if encoder_decoder.load_modes is None or encoder_decoder.load_rest is None:
         return None
     load = forces.reshape(-1)[surrogate.rows]
     places = np.flatnonzero(load)
     if not len(places):
         return 0.0, 0
-    own, modes, rest = load[places], maps.load_modes[places], float(maps.load_rest[0])
+    own, modes, rest = load[places], encoder_decoder.load_modes[places], float(encoder_decoder.load_rest[0])
     along = modes.T @ own  # Woodbury: one small system, whatever the number of places
     inner = modes.T @ modes + rest * np.eye(modes.shape[1])
     square = (own @ own - along @ np.linalg.solve(inner, along)) / rest

@@ -157,7 +157,7 @@ def _predict(surrogate: Surrogate, data: DataSet, samples: Samples) -> tuple[Flo
         times[i] = time.perf_counter() - began
         found[i] = state.displacement
         cotangent = probe_cotangents(data.body, data.shapes, samples.probes[i : i + 1])[0]
-        cosines[i] = cosine(state.pull(cotangent)[loaded], samples.adjoints[i])
+        cosines[i] = cosine(state.vjp(cotangent)[loaded], samples.adjoints[i])
     return found, cosines, times
 
 
@@ -189,7 +189,7 @@ def registration_cosines(surrogate: Surrogate, data: DataSet, samples: Samples, 
     for i, (here, there) in enumerate(zip(samples.displacements, np.roll(samples.displacements, -1, 0), strict=True)):
         forces[loaded] = samples.forces[i]
         cotangent[boundary] = (here - there)[boundary]
-        cosines[i] = cosine(surrogate.solve(forces).pull(cotangent)[loaded], adjoint(here, cotangent)[loaded])
+        cosines[i] = cosine(surrogate.solve(forces).vjp(cotangent)[loaded], adjoint(here, cotangent)[loaded])
     return cosines
 
 
@@ -219,7 +219,7 @@ def jacobian_errors(
     for i, (load, displacement) in enumerate(zip(samples.forces, samples.displacements, strict=True)):
         forces[loaded] = load
         truth = inverse(columns, displacement)
-        errors[i] = np.linalg.norm(surrogate.solve(forces).push(columns) - truth) / np.linalg.norm(truth)
+        errors[i] = np.linalg.norm(surrogate.solve(forces).jvp(columns) - truth) / np.linalg.norm(truth)
     return errors
 
 

@@ -46,13 +46,13 @@ class Value(nn.Module):
 
     def __init__(self, surrogate: Surrogate, basis: Floats, kind: torch.dtype = torch.float32) -> None:
         super().__init__()
-        maps = surrogate.maps
+        encoder_decoder = surrogate.encoder_decoder
         self.network = copy.deepcopy(surrogate.network).to(kind).requires_grad_(False)
         for name, values in (
-            ("offset", maps.offset),
-            ("linear", maps.linear(basis)),
-            ("encode", maps.encoded(basis)),
-            ("decode", maps.decode),
+            ("offset", encoder_decoder.offset),
+            ("linear", encoder_decoder.linear(basis)),
+            ("encode", encoder_decoder.encoded(basis)),
+            ("decode", encoder_decoder.decode),
         ):
             self.register_buffer(name, None if values is None else torch.tensor(values, dtype=kind))
 
@@ -71,7 +71,7 @@ class Linearised(Value):
     def forward(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         """Displacement and Jacobian."""
         at = self.network.linearised(self.encode @ coefficients)
-        slopes = self.linear + self._decoded(at.push(self.encode))
+        slopes = self.linear + self._decoded(at.jvp(self.encode))
         return self.offset + self.linear @ coefficients + self._decoded(at.values[:, None])[:, 0], slopes
 
 
@@ -89,7 +89,7 @@ def leading_directions(surrogate: Surrogate, count: int, device: str = "cpu") ->
     """
     if count < 1:
         raise ValueError(f"leading_directions.count: expected at least 1, got {count}.")
-    inputs, kind = 3 * len(surrogate.maps.loaded), torch.float64 if device == "cpu" else torch.float32
+    inputs, kind = 3 * len(surrogate.encoder_decoder.loaded), torch.float64 if device == "cpu" else torch.float32
     module = Linearised(surrogate, np.eye(inputs), kind).to(device).eval().requires_grad_(False)
     with torch.no_grad(), without_tf32():
         whole = module(torch.zeros(inputs, dtype=kind, device=device))[1].cpu().double().numpy()
@@ -136,7 +136,7 @@ def export(surrogate: Surrogate, folder: Path | str, directions: int = 64) -> Pa
         raise ValueError(f"export.folder: expected none, or one that was exported before, got {folder}.")
     _need_onnx()
     basis = leading_directions(surrogate, directions)
-    inputs = 3 * len(surrogate.maps.loaded)
+    inputs = 3 * len(surrogate.encoder_decoder.loaded)
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -151,7 +151,7 @@ def export(surrogate: Surrogate, folder: Path | str, directions: int = 64) -> Pa
         linearised = torch.export.export(graph, (coefficients,))
         _write(linearised, partial / "linearised", ["coefficients"], ["displacement", "jacobian"])
     np.save(partial / "directions.npy", basis)
-    np.save(partial / "loaded.npy", surrogate.maps.loaded)
+    np.save(partial / "loaded.npy", surrogate.encoder_decoder.loaded)
     manifest = {
         "format": FORMAT,
         "body": surrogate.body.fingerprint,

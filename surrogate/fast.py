@@ -51,7 +51,7 @@ class FastSurrogate:
         if precision not in get_args(Precision):
             raise ValueError(f"FastSurrogate.precision: expected one of {get_args(Precision)}, got {precision!r}.")
         self.device, self.precision, kind = _resolved(device), precision, _KINDS[precision]
-        self.body, self.loaded, self.batch = surrogate.body, surrogate.maps.loaded, batch
+        self.body, self.loaded, self.batch = surrogate.body, surrogate.encoder_decoder.loaded, batch
         self.directions = leading_directions(surrogate, directions, self.device)
         inputs = 3 * len(self.loaded)
         value = Value(surrogate, np.eye(inputs), kind)

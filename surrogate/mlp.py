@@ -16,8 +16,8 @@ from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples
 
 from .architecture import Network
-from .maps import LinearMaps, no_response
-from .scaled import ScaledLesson
+from .encoder_decoder import LinearEncoderDecoder, no_response
+from .standardised import StandardisedObjective
 
 Floats = NDArray[np.float64]
 Activation = Literal["relu", "tanh", "gelu", "silu"]
@@ -60,16 +60,16 @@ class Perceptron:
     def check(self, body: Body) -> None:
         """Any body will do."""
 
-    def lesson(self, data: DataSet, train: Samples, validation: Samples) -> PerceptronLesson:
-        """A `Lesson` with fresh weights."""
-        return PerceptronLesson(data, train, validation, self)
+    def objective(self, data: DataSet, train: Samples, validation: Samples) -> PerceptronObjective:
+        """A `TrainingObjective` with fresh weights."""
+        return PerceptronObjective(data, train, validation, self)
 
     def optimizer(self, network: nn.Module, rate: float) -> torch.optim.Optimizer:
         """Adam."""
         return torch.optim.Adam(network.parameters(), lr=rate, fused=True)
 
     @staticmethod
-    def revived(tensors: Mapping[str, Tensor]) -> HiddenLayers:
+    def from_state_dict(tensors: Mapping[str, Tensor]) -> HiddenLayers:
         """The predicting network from what its `state_dict` was.
 
         Raises:
@@ -156,7 +156,7 @@ class PerceptronNetwork(nn.Module):
         return values
 
 
-class PerceptronLesson(ScaledLesson):
+class PerceptronObjective(StandardisedObjective):
     """The perceptron with its training data.
 
     Args:
@@ -173,13 +173,13 @@ class PerceptronLesson(ScaledLesson):
         inputs, outputs = self.forces.shape[1], train.displacements[0].size
         self.network = PerceptronNetwork(inputs, settings.width or outputs, outputs, settings.activation)
 
-    def maps(self) -> LinearMaps:
+    def encoder_decoder(self) -> LinearEncoderDecoder:
         """First matrix, last matrix and last bias, with the scale factors in them."""
         first, last = _array(self.network.enter.weight), _array(self.network.leave.weight)
         scale = self.displacement_scale
         bias = scale * _array(self.network.leave.bias)
         nothing = no_response(len(last), first.shape[1])
-        return LinearMaps(self.loaded, bias, *nothing, encode=first / self.force_scale, decode=scale * last)
+        return LinearEncoderDecoder(self.loaded, bias, *nothing, encode=first / self.force_scale, decode=scale * last)
 
     def trained(self) -> Network:
         """The hidden layers as they are now in double precision."""

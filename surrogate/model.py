@@ -18,7 +18,7 @@ from softtwin.reference.data.discrepancy import Discrepancy
 from softtwin.reference.data.loading import checked_array
 
 from .architecture import Linearisation, Network
-from .maps import LinearMaps
+from .encoder_decoder import LinearEncoderDecoder
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -37,10 +37,12 @@ class SurrogateState:
     negative_pivots: int | None = None  # a network has no tangent to count them of
 
     def __init__(self, surrogate: Surrogate, coordinates: Floats, linear: Floats) -> None:
-        maps = surrogate.maps
+        encoder_decoder = surrogate.encoder_decoder
         self._surrogate, self.coordinates = surrogate, coordinates
         self._inner = surrogate.network.linearised(torch.from_numpy(coordinates))
-        self.displacement: Floats = (maps.offset + linear + maps.decoded(self._inner.values.numpy())).reshape(-1, 3)
+        self.displacement: Floats = (
+            encoder_decoder.offset + linear + encoder_decoder.decoded(self._inner.values.numpy())
+        ).reshape(-1, 3)
 
     @property
     def distance(self) -> float | None:
@@ -48,14 +50,14 @@ class SurrogateState:
 
         1 at the farthest load of the training; None where that was not measured. It costs next to nothing on any body.
         """
-        spread, domain = self._surrogate.maps.spread, self._surrogate.card.get("domain")
+        spread, domain = self._surrogate.encoder_decoder.spread, self._surrogate.card.get("domain")
         if spread is None or domain is None:
             return None
         scaled = self.coordinates / spread
         return float(np.sqrt(scaled @ scaled / len(scaled)) / domain["reach"])
 
     @property
-    def extent(self) -> float | None:
+    def extrapolation_ratio(self) -> float | None:
         """How far the load lies out: 1 at the farthest load of the training; None where that was not measured.
 
         The larger of `distance` and of the largest displacement of a node, relative to the largest of the training.
@@ -68,20 +70,20 @@ class SurrogateState:
 
     @property
     def is_inside(self) -> bool | None:
-        """Whether the load lies among those that were learned (`extent` is 1 at most); None where nobody knows."""
-        extent = self.extent
-        return None if extent is None else extent <= 1.0
+        """Whether the extrapolation ratio is 1 at most, within the training loads; None where it is not known."""
+        extrapolation_ratio = self.extrapolation_ratio
+        return None if extrapolation_ratio is None else extrapolation_ratio <= 1.0
 
-    def push(self, changes: ArrayLike) -> Floats:
+    def jvp(self, changes: ArrayLike) -> Floats:
         """J B, (3n, k), for changes of the forces B, (3n, k).
 
         Raises:
             ValueError: another shape, numbers that are not finite, or changes at nodes that never carry load.
         """
-        linear, encoded = self._surrogate.linear_push(changes)
-        return linear + self._surrogate.maps.decoded(tangent(self._inner, encoded))
+        linear, encoded = self._surrogate.linear_jvp(changes)
+        return linear + self._surrogate.encoder_decoder.decoded(tangent(self._inner, encoded))
 
-    def pull(self, cotangent: ArrayLike) -> Floats:
+    def vjp(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3): J^T g, zero at nodes that never carry load.
 
         Args:
@@ -92,12 +94,12 @@ class SurrogateState:
         """
         given, shape = np.asarray(cotangent, dtype=np.float64), self.displacement.shape
         if given.ndim == 3 and len(given):
-            return np.stack([self.pull(each) for each in given])
-        maps = self._surrogate.maps
+            return np.stack([self.vjp(each) for each in given])
+        encoder_decoder = self._surrogate.encoder_decoder
         flat = checked_array("SurrogateState.cotangent", given, shape).ravel()
         gradient = np.zeros_like(flat)
-        inner = self._inner.pull(torch.from_numpy(maps.decoded_adjoint(flat))).numpy()
-        gradient[self._surrogate.rows] = maps.linear_adjoint(flat) + maps.encoded_adjoint(inner)
+        inner = self._inner.vjp(torch.from_numpy(encoder_decoder.decoded_adjoint(flat))).numpy()
+        gradient[self._surrogate.rows] = encoder_decoder.linear_adjoint(flat) + encoder_decoder.encoded_adjoint(inner)
         return gradient.reshape(-1, 3)
 
 
@@ -108,20 +110,22 @@ class Surrogate:
 
     Args:
         body: the body it was trained on.
-        maps: linear maps around the network.
+        encoder_decoder: linear maps around the network.
         network: the network, in double precision, on the CPU, its weights frozen.
         card: what it was trained on and how well it does.
     """
 
-    def __init__(self, body: Body, maps: LinearMaps, network: Network, card: Mapping[str, Any]) -> None:
+    def __init__(
+        self, body: Body, encoder_decoder: LinearEncoderDecoder, network: Network, card: Mapping[str, Any]
+    ) -> None:
         self.body = body
-        self.maps = maps
+        self.encoder_decoder = encoder_decoder
         self.network = network
         self.card: Mapping[str, Any] = MappingProxyType(dict(card))
-        self.rows = (3 * maps.loaded[:, None] + np.arange(3)).ravel()
-        self._wanted: tuple[Ints, Floats] = np.zeros(0, dtype=np.int64), maps.left[:0]  # rows, left's rows
+        self.rows = (3 * encoder_decoder.loaded[:, None] + np.arange(3)).ravel()
+        self._wanted: tuple[Ints, Floats] = np.zeros(0, dtype=np.int64), encoder_decoder.left[:0]  # rows, left's rows
         self._pushed: tuple[Floats, Floats, Floats] | None = None  # changes, linear parts, coordinates
-        self._idle = np.setdiff1d(np.arange(len(body.points)), np.union1d(maps.loaded, body.fixed))
+        self._idle = np.setdiff1d(np.arange(len(body.points)), np.union1d(encoder_decoder.loaded, body.fixed))
 
     @cached_property
     def single(self) -> Network:
@@ -150,7 +154,11 @@ class Surrogate:
     @cached_property
     def discrepancy(self) -> Discrepancy | None:
         """The errors of the validation samples as patterns; None where they were not measured."""
-        modes, rest, known = self.maps.error_modes, self.maps.error_rest, self.card.get("discrepancy")
+        modes, rest, known = (
+            self.encoder_decoder.error_modes,
+            self.encoder_decoder.error_rest,
+            self.card.get("discrepancy"),
+        )
         return None if modes is None or rest is None or not known else Discrepancy(modes, rest, known["places"])
 
     def solve(self, forces: ArrayLike, near: Any = None) -> SurrogateState:
@@ -167,7 +175,7 @@ class Surrogate:
         load = checked_array("Surrogate.forces", forces, self.body.points.shape)
         self._refuse_idle("forces", np.abs(load).max(axis=1))
         loads = load.ravel()[self.rows]
-        return SurrogateState(self, self.maps.encoded(loads), self.maps.linear(loads))
+        return SurrogateState(self, self.encoder_decoder.encoded(loads), self.encoder_decoder.linear(loads))
 
     def propose(self, forces: ArrayLike, linear: Floats | None = None) -> Floats:
         """The displacement alone, (n, 3), metres, in single precision and half of the time: for Newton to start from.
@@ -181,15 +189,15 @@ class Surrogate:
         """
         load = checked_array("Surrogate.forces", forces, self.body.points.shape)
         self._refuse_idle("forces", np.abs(load).max(axis=1))
-        loads, maps = load.ravel()[self.rows].astype(np.float32), self._rounded
-        values = self.single.linearised(torch.from_numpy(maps.encoded(loads))).values.numpy()
-        known = linear is not None and maps.left.shape[1] > 0
-        rest = linear.ravel() if known and linear is not None else maps.linear(loads)
-        return np.float64(maps.offset + rest + maps.decoded(values)).reshape(-1, 3)
+        loads, encoder_decoder = load.ravel()[self.rows].astype(np.float32), self._rounded
+        values = self.single.linearised(torch.from_numpy(encoder_decoder.encoded(loads))).values.numpy()
+        known = linear is not None and encoder_decoder.left.shape[1] > 0
+        rest = linear.ravel() if known and linear is not None else encoder_decoder.linear(loads)
+        return np.float64(encoder_decoder.offset + rest + encoder_decoder.decoded(values)).reshape(-1, 3)
 
     @cached_property
-    def _rounded(self) -> LinearMaps:
-        return self.maps.rounded()
+    def _rounded(self) -> LinearEncoderDecoder:
+        return self.encoder_decoder.rounded()
 
     def reduced(self, nodes: ArrayLike, basis: ArrayLike) -> ReducedSurrogate:
         """The surrogate between a few force coefficients and a few nodes, all that can be computed before computed.
@@ -199,7 +207,7 @@ class Surrogate:
             basis: force basis B, (3n, k), newtons; the forces are B c for coefficients c.
 
         Raises:
-            ValueError: node numbers out of range, or a basis as `SurrogateState.push` refuses it.
+            ValueError: node numbers out of range, or a basis as `SurrogateState.jvp` refuses it.
         """
         chosen = np.asarray(nodes)
         if chosen.ndim != 1 or not np.issubdtype(chosen.dtype, np.integer):
@@ -216,26 +224,32 @@ class Surrogate:
             columns: forces at the loaded nodes, (3l, k), newtons.
         """
         if not np.array_equal(self._wanted[0], rows):  # each cold frame asks for the same again
-            self._wanted = rows, np.ascontiguousarray(self.maps.left[rows])
-        return self._wanted[1] @ (columns if self.maps.right is None else self.maps.right @ columns)
+            self._wanted = rows, np.ascontiguousarray(self.encoder_decoder.left[rows])
+        return self._wanted[1] @ (
+            columns if self.encoder_decoder.right is None else self.encoder_decoder.right @ columns
+        )
 
-    def linear_push(self, changes: ArrayLike) -> tuple[Floats, Floats]:
+    def linear_jvp(self, changes: ArrayLike) -> tuple[Floats, Floats]:
         """What changes of the forces B, (3n, k), do in any state: J B's linear part, (3n, k), and coordinates, (d, k).
 
         Raises:
-            ValueError: see `SurrogateState.push`.
+            ValueError: see `SurrogateState.jvp`.
         """
         known = self._pushed  # read once: another thread may ask for something else
         if known is None or not np.array_equal(known[0], changes):
             columns = self.at_loaded("changes", changes)
-            known = np.array(changes, dtype=np.float64), self.maps.linear(columns), self.maps.encoded(columns)
+            known = (
+                np.array(changes, dtype=np.float64),
+                self.encoder_decoder.linear(columns),
+                self.encoder_decoder.encoded(columns),
+            )
             if columns.shape[1] <= _REMEMBERED:  # each frame asks for the same, a whole Jacobian is asked for once
                 self._pushed = known
         return known[1], known[2]
 
     def with_card(self, **entries: Any) -> Surrogate:
         """The same surrogate with more entries in its card, for instance held-out errors."""
-        return Surrogate(self.body, self.maps, self.network, {**self.card, **entries})
+        return Surrogate(self.body, self.encoder_decoder, self.network, {**self.card, **entries})
 
     def unseen(self, forces: Floats) -> Ints:
         """Nodes that forces, (n, 3), act on though none did in training: of those a prediction would know nothing."""
@@ -259,8 +273,8 @@ class Surrogate:
         bad = self._idle[sizes[self._idle] > 0.0]
         if len(bad):
             raise ValueError(
-                f"Surrogate.{name}: expected forces at the {len(self.maps.loaded)} nodes that carried load in "
-                f"training (surrogate.maps.loaded), got some at {len(bad)} other nodes, first {bad[:5].tolist()}."
+                f"Surrogate.{name}: expected forces at the {len(self.encoder_decoder.loaded)} nodes loaded in "
+                f"training (surrogate.encoder_decoder.loaded), got {len(bad)} others, first {bad[:5].tolist()}."
             )
 
 
@@ -268,9 +282,9 @@ def tangent(inner: Linearisation, columns: Floats) -> Floats:
     """Network derivative times columns (d, k), (e, k), by way of the whole derivative where they outnumber it."""
     size, kind = columns.shape[0], inner.values.dtype
     if columns.shape[1] > size:
-        whole = inner.push(torch.eye(size, dtype=kind)).numpy()
+        whole = inner.jvp(torch.eye(size, dtype=kind)).numpy()
         return whole.astype(np.float64) @ columns
-    return inner.push(torch.from_numpy(columns).to(kind)).numpy().astype(np.float64, copy=False)
+    return inner.jvp(torch.from_numpy(columns).to(kind)).numpy().astype(np.float64, copy=False)
 
 
 class ReducedSurrogateState:
@@ -327,17 +341,17 @@ class ReducedSurrogate:
     """
 
     def __init__(self, surrogate: Surrogate, nodes: Ints, basis: Floats) -> None:
-        maps = surrogate.maps
+        encoder_decoder = surrogate.encoder_decoder
         picked = (3 * nodes[:, None] + np.arange(3)).ravel()
         self.surrogate, self._basis, self._combination = surrogate, basis, np.eye(basis.shape[1])
-        self.encode = maps.encoded(basis)
+        self.encode = encoder_decoder.encoded(basis)
         self._linear_rows = surrogate.linear_rows(picked, basis)
-        self.wanted = picked if maps.decode is None else slice(None)  # of the network's values
-        self._decode_rows = np.eye(len(picked)) if maps.decode is None else maps.decode[picked]
+        self.wanted = picked if encoder_decoder.decode is None else slice(None)  # of the network's values
+        self._decode_rows = np.eye(len(picked)) if encoder_decoder.decode is None else encoder_decoder.decode[picked]
         self.rows = np.hstack(
             [self._linear_rows, self._decode_rows]
         )  # by the coefficients and by what the network says
-        self.offset_rows = maps.offset[picked]
+        self.offset_rows = encoder_decoder.offset[picked]
 
     @property
     def count(self) -> int:
@@ -355,7 +369,7 @@ class ReducedSurrogate:
 
     @cached_property
     def _linear(self) -> Floats:
-        return self.surrogate.maps.linear(self._basis @ self._combination)
+        return self.surrogate.encoder_decoder.linear(self._basis @ self._combination)
 
     def linear(self, coefficients: Floats) -> Floats:
         """Linear part of the displacement of all nodes, (3n,), metres."""

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from softtwin.reference.data.dataset import DataSet
 
 from .architecture import Network
-from .maps import LinearMaps
+from .encoder_decoder import LinearEncoderDecoder
 from .residual import ElasticBody
 
 _LEAST_JACOBIAN = 0.1  # det F below it counts for more: a fresh network turns cells inside out
@@ -48,7 +48,7 @@ class Physics:
             raise ValueError("Physics: expected a positive weight of energy, residual or data, got none.")
 
 
-class PhysicsLesson(nn.Module):
+class PhysicsObjective(nn.Module):
     """A lesson with terms of physics in its loss.
 
     Predictions are taken for what they are at the free nodes. Those at fixed nodes, which a network that does not keep
@@ -56,7 +56,7 @@ class PhysicsLesson(nn.Module):
     the linear response.
 
     Args:
-        lesson: a `Lesson`, network and data.
+        objective: a `TrainingObjective`, network and data.
         data: the data set, for its body, material and linear response.
         physics: weights.
     """
@@ -65,11 +65,11 @@ class PhysicsLesson(nn.Module):
     _left: Tensor
     _right: Tensor
 
-    def __init__(self, lesson: Any, data: DataSet, physics: Physics) -> None:
+    def __init__(self, objective: Any, data: DataSet, physics: Physics) -> None:
         super().__init__()
-        self.lesson, self.physics = lesson, physics
-        self.body = ElasticBody(data.body, data.material, least_jacobian=_LEAST_JACOBIAN).float()
-        samples = lesson.fields(torch.arange(min(lesson.sample_count, 256)))[1]
+        self.objective, self.physics = objective, physics
+        self.body = ElasticBody(data.body, data.material, minimum_jacobian=_LEAST_JACOBIAN).float()
+        samples = objective.fields(torch.arange(min(objective.sample_count, 256)))[1]
         loaded = data.response.loaded
         linear = data.response.apply(samples[:, loaded].double().numpy())
         work = 0.5 * (linear[:, loaded] * samples[:, loaded].double().numpy()).sum(axis=(1, 2))
@@ -83,23 +83,23 @@ class PhysicsLesson(nn.Module):
     @property
     def network(self) -> nn.Module:
         """The network in training."""
-        network: nn.Module = self.lesson.network
+        network: nn.Module = self.objective.network
         return network
 
     @property
     def sample_count(self) -> int:
         """Number of training samples, images of them counted."""
-        count: int = self.lesson.sample_count
+        count: int = self.objective.sample_count
         return count
 
     def loss(self, batch: Tensor) -> Tensor:
         """The weighted sum over the samples with the given numbers; beside data, physics of their first eighth."""
         wanted = self.physics
-        total = wanted.data * self.lesson.loss(batch) if wanted.data else torch.zeros((), device=batch.device)
+        total = wanted.data * self.objective.loss(batch) if wanted.data else torch.zeros((), device=batch.device)
         if not wanted.energy + wanted.residual:
             return total
         some = batch[: -(-len(batch) // _SHARE)] if wanted.data else batch
-        return total + self._physics(*self.lesson.fields(some))
+        return total + self._physics(*self.objective.fields(some))
 
     def _physics(self, displacement: Tensor, forces: Tensor) -> Tensor:
         wanted, free = self.physics, displacement * self.body.free
@@ -121,22 +121,22 @@ class PhysicsLesson(nn.Module):
     def error(self) -> float:
         """Error over the validation samples: the architecture's own; without data the loss, which needs no labels."""
         if self.physics.data:
-            return float(self.lesson.error())
-        whole = torch.arange(self.lesson.validation_count, device=self._left.device).split(_AT_ONCE)
-        losses = [len(some) * self._physics(*self.lesson.fields(some, validation=True)) for some in whole]
-        return float(torch.stack(losses).sum()) / self.lesson.validation_count
+            return float(self.objective.error())
+        whole = torch.arange(self.objective.validation_count, device=self._left.device).split(_AT_ONCE)
+        losses = [len(some) * self._physics(*self.objective.fields(some, validation=True)) for some in whole]
+        return float(torch.stack(losses).sum()) / self.objective.validation_count
 
-    def maps(self) -> LinearMaps:
+    def encoder_decoder(self) -> LinearEncoderDecoder:
         """The linear maps around the network."""
-        maps: LinearMaps = self.lesson.maps()
-        return maps
+        encoder_decoder: LinearEncoderDecoder = self.objective.encoder_decoder()
+        return encoder_decoder
 
     def trained(self) -> Network:
         """The network that predicts, with the weights as they are now."""
-        network: Network = self.lesson.trained()
+        network: Network = self.objective.trained()
         return network
 
 
-def with_physics(lesson: Any, data: DataSet, physics: Physics | None) -> Any:
-    """The `Lesson`, with physics in its loss where some is wanted."""
-    return lesson if physics is None else PhysicsLesson(lesson, data, physics)
+def with_physics(objective: Any, data: DataSet, physics: Physics | None) -> Any:
+    """The `TrainingObjective`, with physics in its loss where some is wanted."""
+    return objective if physics is None else PhysicsObjective(objective, data, physics)

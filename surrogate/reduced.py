@@ -22,7 +22,7 @@ from softtwin.reference.data.dataset import DataSet, LinearResponse, Samples, pr
 from softtwin.reference.data.jacobians import Jacobians, read_jacobians
 
 from .architecture import Network
-from .maps import LinearMaps, response_parts
+from .encoder_decoder import LinearEncoderDecoder, response_parts
 from .optimizers import MuonWithAdamW
 from .pod import ReducedBasis, basis_of, learned_basis, semi_relative, sizes_of
 
@@ -75,9 +75,9 @@ class Reduced:
     def check(self, body: Body) -> None:
         """Any body will do."""
 
-    def lesson(self, data: DataSet, train: Samples, validation: Samples) -> ReducedLesson:
-        """A `Lesson` with fresh weights."""
-        return ReducedLesson(data, train, validation, self)
+    def objective(self, data: DataSet, train: Samples, validation: Samples) -> ReducedObjective:
+        """A `TrainingObjective` with fresh weights."""
+        return ReducedObjective(data, train, validation, self)
 
     def optimizer(self, network: ReducedNetwork, rate: float) -> torch.optim.Optimizer:
         """Muon for the blocks, AdamW for the layers around them."""
@@ -87,7 +87,7 @@ class Reduced:
         return MuonWithAdamW(hidden, others, rate, _WEIGHT_DECAY)
 
     @staticmethod
-    def revived(tensors: Mapping[str, Tensor]) -> AveragedNetwork:
+    def from_state_dict(tensors: Mapping[str, Tensor]) -> AveragedNetwork:
         """The predicting network from what its `state_dict` was."""
         depth = sum(name.startswith("inner") and name.endswith("weight") for name in tensors)
         inner = ReducedNetwork(tensors["input_scale"], 1.0, len(tensors["enter.bias"]), depth)
@@ -214,7 +214,7 @@ class LinearisedAverage:
         z = torch.stack(self._trace)
         return gate, 0.5 + 0.5 * torch.erf(_ROOT_HALF * z) + z * torch.exp(-0.5 * z * z) * _DENSITY
 
-    def push(self, tangents: Tensor) -> Tensor:
+    def jvp(self, tangents: Tensor) -> Tensor:
         """Changes of the values, (r, k), for changes of the coordinates, (r, k)."""
         net = self.network
         gate, slopes = self._slopes
@@ -226,7 +226,7 @@ class LinearisedAverage:
         change += (dx @ gate[:, :, None]) * self._missing[:, None]
         return ((change * net.output_scale) @ net.turns).mean(dim=0).T
 
-    def pull(self, cotangent: Tensor) -> Tensor:
+    def vjp(self, cotangent: Tensor) -> Tensor:
         """Gradient with respect to the coordinates, (r,), for one with respect to the values, (r,)."""
         net = self.network
         gate, slopes = self._slopes
@@ -241,7 +241,7 @@ class LinearisedAverage:
 # ------------------------------------------------------------------ what it learns
 
 
-class ReducedLesson(nn.Module):
+class ReducedObjective(nn.Module):
     """The reduced network with its training data in reduced coordinates; loss and validation error are methods.
 
     The loss is |u - u*|^2 / (|u*| rms + 0.01 rms^2), without the part outside the modes, plus `sobolev` times the
@@ -359,11 +359,11 @@ class ReducedLesson(nn.Module):
         missed = (self.network(self.validation_loads) - self.validation_targets).square().sum(dim=1)
         return float(((missed + self.validation_rest) * self.validation_weights).sqrt().mean())
 
-    def maps(self) -> LinearMaps:
+    def encoder_decoder(self) -> LinearEncoderDecoder:
         """The linear response, and the modes on both sides of the network."""
         encode = np.ascontiguousarray(self.basis.restricted.T)
         left, right = response_parts(self.response)
-        return LinearMaps(self.response.loaded, np.zeros(len(left)), left, right, encode, self.basis.modes)
+        return LinearEncoderDecoder(self.response.loaded, np.zeros(len(left)), left, right, encode, self.basis.modes)
 
     def trained(self) -> AveragedNetwork:
         """The network as it is now in double precision, averaged over the symmetries."""

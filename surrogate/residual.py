@@ -29,7 +29,7 @@ class ElasticBody(nn.Module):
         body: the body, in space.
         material: strain energy; not mixed, and not an own `Energy`, which is written in UFL.
         weights: factor of each cell's energy, (cells,), in place of the body's own fractions.
-        least_jacobian: for training: det F below it counts for more (`TorchAlgebra`), and nothing is NaN; 0 leaves all
+        minimum_jacobian: for training: det F below it counts more (`TorchAlgebra`), and nothing is NaN; 0 leaves all
             as it is.
 
     Raises:
@@ -42,7 +42,7 @@ class ElasticBody(nn.Module):
     free: Tensor
 
     def __init__(
-        self, body: Body, material: Material, weights: ArrayLike | None = None, *, least_jacobian: float = 0.0
+        self, body: Body, material: Material, weights: ArrayLike | None = None, *, minimum_jacobian: float = 0.0
     ) -> None:
         super().__init__()
         if body.dimension != 3:
@@ -55,7 +55,7 @@ class ElasticBody(nn.Module):
         part = own if weights is None else np.asarray(weights, dtype=np.float64)
         if part.shape != (len(body.cells),):
             raise ValueError(f"ElasticBody.weights: expected shape ({len(body.cells)},), got {part.shape}.")
-        self.material, self.nodes, self.least_jacobian = material, len(body.points), least_jacobian
+        self.material, self.nodes, self.minimum_jacobian = material, len(body.points), minimum_jacobian
         points, factors = quadrature(body.kind, quadrature_degree(body))
         shaped = linear_kind(body.kind) if body.is_straight else body.kind
         corners = body.points[body.cells[:, : shaped.nodes]]
@@ -153,5 +153,7 @@ class ElasticBody(nn.Module):
     def density(self, F: Tensor) -> Tensor:
         """Strain energy of deformation gradients, (..., 3, 3), joules a cubic metre, (...)."""
         named = {name: getattr(self, f"parameter_{name}") for name in self.material.parameters}
-        density: Tensor = self.material.energy(F, None, SimpleNamespace(**named), TorchAlgebra(F, self.least_jacobian))
+        density: Tensor = self.material.energy(
+            F, None, SimpleNamespace(**named), TorchAlgebra(F, self.minimum_jacobian)
+        )
         return density

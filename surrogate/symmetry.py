@@ -56,8 +56,10 @@ def symmetries(body: Body, loaded: Ints, tolerance: float = 1e-6) -> tuple[Symme
     tree = cKDTree(centred)
     for axes in (np.eye(3), np.linalg.eigh(centred.T @ centred)[1]):
         found = [identity(body)]
-        for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)):
-            rotation = axes @ (np.array(signs)[:, None] * np.eye(3)[list(order)]) @ axes.T
+        for order, indicators in itertools.product(
+            itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
+        ):
+            rotation = axes @ (np.array(indicators)[:, None] * np.eye(3)[list(order)]) @ axes.T
             distance, nodes = tree.query(centred @ rotation.T)
             moved = not np.allclose(rotation, np.eye(3))
             if moved and distance.max() < tolerance * body.size and _maps(body, loaded, nodes):

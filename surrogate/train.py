@@ -17,10 +17,10 @@ from softtwin.reference.data.dataset import DataSet, Samples
 from softtwin.reference.data.schema import Reason
 
 from .checkpoint import CHECKPOINT, fingerprint, read_checkpoint
-from .course import Course, chosen_device, fit
 from .model import Surrogate
 from .physics import with_physics
 from .plan import TrainingPlan
+from .training_module import TrainingModule, chosen_device, fit
 
 
 def train(
@@ -55,15 +55,17 @@ def train(
         resumed = read_checkpoint(path, plan, mark) if path.exists() else None
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(plan.seed)
-            lesson = plan.architecture.lesson(data, splits["train"], splits["validation"])
-        lesson = with_physics(lesson, data, plan.physics).to(where)
-        course = Course(lesson, plan, mark, clock)
+            objective = plan.architecture.objective(data, splits["train"], splits["validation"])
+        objective = with_physics(objective, data, plan.physics).to(where)
+        training_module = TrainingModule(objective, plan, mark, clock)
         if resumed:
-            course.take_back(resumed)
-        if course.share < 1.0:
-            fit(course, path, resumed is not None, log=folder is not None)
-    lesson.network.load_state_dict(course.best)
-    return Surrogate(data.body, lesson.maps(), lesson.trained(), _card(data, plan, splits, course))
+            training_module.take_back(resumed)
+        if training_module.share < 1.0:
+            fit(training_module, path, resumed is not None, log=folder is not None)
+    objective.network.load_state_dict(training_module.best)
+    return Surrogate(
+        data.body, objective.encoder_decoder(), objective.trained(), _card(data, plan, splits, training_module)
+    )
 
 
 def _check_split(data: DataSet, name: str, samples: Samples) -> None:
@@ -78,7 +80,9 @@ def _check_split(data: DataSet, name: str, samples: Samples) -> None:
         )
 
 
-def _card(data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], course: Course) -> dict[str, Any]:
+def _card(
+    data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], training_module: TrainingModule
+) -> dict[str, Any]:
     train_split = splits["train"]
     reasons = data.figures("train")["reason"][: plan.samples]
     rejected = Counter(Reason(reason).words for reason in reasons if reason)
@@ -87,7 +91,7 @@ def _card(data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], course:
         "plan": plan.entries(),
         "data": {
             "path": str(data.path),
-            "fingerprint": course.mark,
+            "fingerprint": training_module.mark,
             "identity": data.identity,
             "versions": data.header.get("versions", {}),
             "plan": data.header.get("plan", {}),
@@ -95,10 +99,10 @@ def _card(data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], course:
         },
         "samples": {**{name: len(samples) for name, samples in splits.items()}, "rejected": dict(rejected)},
         "training": {
-            "parameters": sum(p.numel() for p in course.lesson.network.parameters()),
-            "steps": course.steps_made,
-            "seconds": course.seconds,
-            "validation_error": course.best_error,
+            "parameters": sum(p.numel() for p in training_module.objective.network.parameters()),
+            "steps": training_module.steps_made,
+            "seconds": training_module.seconds,
+            "validation_error": training_module.best_error,
             "device": chosen_device(plan),
             "versions": {"torch": torch.__version__, "lightning": lightning.__version__},
         },

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples
 
-from .scaled import FieldLesson, FieldNetwork
+from .standardised import FieldNetwork, FieldObjective
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,16 @@ class Transolver:
     def check(self, body: Body) -> None:
         """Any body will do."""
 
-    def lesson(self, data: DataSet, train: Samples, validation: Samples) -> TransolverLesson:
-        """A `Lesson` with fresh weights."""
-        return TransolverLesson(data, train, validation, self)
+    def objective(self, data: DataSet, train: Samples, validation: Samples) -> TransolverObjective:
+        """A `TrainingObjective` with fresh weights."""
+        return TransolverObjective(data, train, validation, self)
 
     def optimizer(self, network: nn.Module, rate: float) -> torch.optim.Optimizer:
         """AdamW."""
         return torch.optim.AdamW(network.parameters(), lr=rate, fused=True)
 
     @staticmethod
-    def revived(tensors: Mapping[str, Tensor]) -> TransolverNetwork:
+    def from_state_dict(tensors: Mapping[str, Tensor]) -> TransolverNetwork:
         """The predicting network from what its `state_dict` was."""
         depth = sum(name.endswith("attention.temperature") for name in tensors)
         heads = tensors["blocks.0.attention.temperature"].numel()
@@ -149,7 +149,7 @@ class TransolverNetwork(FieldNetwork):
         return displacement
 
 
-class TransolverLesson(FieldLesson):
+class TransolverObjective(FieldObjective):
     """The network with its training data.
 
     Args:

@@ -18,7 +18,7 @@ from safetensors.numpy import save as save_tensors
 from softtwin.meshes.body import Body
 
 from .architecture import Network
-from .maps import LinearMaps
+from .encoder_decoder import LinearEncoderDecoder
 from .model import Surrogate
 from .registry import ARCHITECTURES
 
@@ -45,7 +45,7 @@ def save(surrogate: Surrogate, folder: Path | str, single: bool = False) -> None
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    tensors = {f"{_MAPS}{name}": array for name, array in surrogate.maps.arrays().items()}
+    tensors = {f"{_MAPS}{name}": array for name, array in surrogate.encoder_decoder.arrays().items()}
     tensors |= {f"{_NETWORK}{name}": tensor.numpy() for name, tensor in surrogate.network.state_dict().items()}
     if single:
         tensors = {name: _as(array, np.float64, np.float32) for name, array in tensors.items()}
@@ -93,7 +93,7 @@ def load(folder: Path | str, body: Body) -> Surrogate:
     tensors = _read_weights(folder / WEIGHTS, card["weights"])
     if card.get("stored") == "single":
         tensors = {name: _as(array, np.float32, np.float64) for name, array in tensors.items()}
-    maps: dict[str, Any] = {
+    encoder_decoder: dict[str, Any] = {
         name.removeprefix(prefix): array
         for name, array in tensors.items()
         for prefix in (_MAPS, _MAPS_BEFORE)
@@ -104,12 +104,12 @@ def load(folder: Path | str, body: Body) -> Surrogate:
     }
     with torch.random.fork_rng(devices=[]):  # the weights are given: the caller's chance is left alone
         network = _revived(folder, card["architecture"], weights)
-    return Surrogate(body, LinearMaps(**maps), network, card)
+    return Surrogate(body, LinearEncoderDecoder(**encoder_decoder), network, card)
 
 
 def _revived(folder: Path, architecture: str, weights: dict[str, torch.Tensor]) -> Network:
     try:
-        return ARCHITECTURES[architecture].revived(weights)
+        return ARCHITECTURES[architecture].from_state_dict(weights)
     except ValueError as error:
         raise TwinError(
             f"load.folder: the network in {folder} is of a newer version of this program: {error}"

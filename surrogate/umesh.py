@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples
 
-from .scaled import FieldLesson, FieldNetwork
+from .standardised import FieldNetwork, FieldObjective
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -60,20 +60,20 @@ class UMesh:
         """
         lattice(body)
 
-    def lesson(self, data: DataSet, train: Samples, validation: Samples) -> UMeshLesson:
-        """A `Lesson` with fresh weights.
+    def objective(self, data: DataSet, train: Samples, validation: Samples) -> UMeshObjective:
+        """A `TrainingObjective` with fresh weights.
 
         Raises:
             ValueError: the body's nodes are not those of a regular grid.
         """
-        return UMeshLesson(data, train, validation, self)
+        return UMeshObjective(data, train, validation, self)
 
     def optimizer(self, network: nn.Module, rate: float) -> torch.optim.Optimizer:
         """Adam."""
         return torch.optim.Adam(network.parameters(), lr=rate, fused=True)
 
     @staticmethod
-    def revived(tensors: Mapping[str, Tensor]) -> UMeshNetwork:
+    def from_state_dict(tensors: Mapping[str, Tensor]) -> UMeshNetwork:
         """The predicting network from what its `state_dict` was."""
         levels = sum(name.startswith("rises") and name.endswith("bias") for name in tensors)
         shape = (int(size) for size in tensors["shape"])
@@ -177,7 +177,7 @@ def _two(inputs: int, outputs: int) -> nn.Sequential:
     )
 
 
-class UMeshLesson(FieldLesson):
+class UMeshObjective(FieldObjective):
     """U-Mesh with its training data; the loss is that of the body's nodes alone, a masked loss.
 
     Args:

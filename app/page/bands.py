@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Colour = tuple[int, int, int]
 
-UNTOLD: Colour = (200, 160, 150)  # of an organ about which nothing is said
+UNINFORMED: Colour = (200, 160, 150)  # of an organ about which nothing is said
 COLOURS: tuple[Colour, ...] = (
     (65, 171, 150),
     (250, 215, 110),

@@ -1,4 +1,4 @@
-"""A simulated camera: clouds of an organ whose true states are known, as noisy, partial and askew as is asked."""
+"""A simulated camera: clouds of an organ whose true states are known, as noisy, partial and misaligned as is asked."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class View:
     shift: float = 0.0
 
     @property
-    def is_askew(self) -> bool:
+    def is_misaligned(self) -> bool:
         """Whether the camera's coordinates are not the body's, so that the pose is to be found."""
         return bool(self.turn or self.shift)
 

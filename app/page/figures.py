@@ -11,7 +11,7 @@ import numpy as np
 from softtwin.registration.verdict import Verdict
 
 from ..record import NOTICE
-from .bands import COLOURS, UNTOLD, Colour, Scale
+from .bands import COLOURS, UNINFORMED, Colour, Scale
 from .scene import colour_of, spoken
 
 _VERDICTS = {Verdict.ACCEPTED: "#1b7f4b", Verdict.DOUBTFUL: "#b36b00", Verdict.REFUSED: "#b00020"}
@@ -38,8 +38,8 @@ class Figures:
         dropped: clouds that came and were never registered, in all.
         rate: answers a second.
         engine: that registers.
-        askew: by what the camera is seen to stand elsewhere than was said: a shift, and a turn in radians; None where
-            it is not.
+        pose_correction: translation in metres and rotation in radians from where the camera was said to stand
+            to where it is found; None where the cloud shows none.
     """
 
     title: str
@@ -57,7 +57,7 @@ class Figures:
     dropped: int = 0
     rate: float = np.nan
     engine: str = ""
-    askew: tuple[float, float] | None = None
+    pose_correction: tuple[float, float] | None = None
 
 
 def figures_html(figures: Figures) -> str:
@@ -73,16 +73,16 @@ def figures_html(figures: Figures) -> str:
     return f'<div style="padding:0 12px;font-family:sans-serif">{head}{_structures(figures)}{_others(figures)}</div>'
 
 
-def legend_html(scale: Scale, has_untold: bool) -> str:
+def legend_html(scale: Scale, has_uninformed: bool) -> str:
     """The bands' colours with their meaning, as HTML.
 
     Args:
         scale: the bands.
-        has_untold: whether a part of the organ may have none.
+        has_uninformed: whether a part of the organ may have none.
     """
     rows = [_chip(colour, f"{words} mm") for colour, words in zip(COLOURS, scale.words(), strict=True)]
-    if has_untold:
-        rows.append(_chip(UNTOLD, "not told"))
+    if has_uninformed:
+        rows.append(_chip(UNINFORMED, "not told"))
     title = f'<div style="font-size:14px;font-weight:600;margin-bottom:4px">{escape(scale.title)}</div>'
     return f'<div style="padding:4px 12px;font-family:sans-serif">{title}{"".join(rows)}</div>'
 
@@ -128,12 +128,12 @@ def _others(figures: Figures) -> str:
         share = f" ({100 * figures.confidence:.0f} % of loads)" if np.isfinite(figures.confidence) else ""
         rows.append((f"largest error{share}", f"≤ {_mm(figures.bound)}"))
     if np.isfinite(figures.net_force):
-        doubt = f" ± {figures.net_force_deviation:.2f}" if np.isfinite(figures.net_force_deviation) else ""
-        rows.append(("net force", f"{figures.net_force:.2f}{doubt} N"))
+        deviation = f" ± {figures.net_force_deviation:.2f}" if np.isfinite(figures.net_force_deviation) else ""
+        rows.append(("net force", f"{figures.net_force:.2f}{deviation} N"))
     if np.isfinite(figures.true_net_force):
         rows.append(("true net force", f"{figures.true_net_force:.2f} N"))
-    if figures.askew is not None:
-        shift, turn = figures.askew
+    if figures.pose_correction is not None:
+        shift, turn = figures.pose_correction
         rows.append(("camera elsewhere by", f"{_mm(shift)}, {np.rad2deg(turn):.1f}°"))
     for name, seconds in (("frame time", figures.frame_time), ("age of the answer", figures.age)):
         if np.isfinite(seconds):

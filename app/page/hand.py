@@ -115,4 +115,4 @@ def _warm(twin: Twin) -> None:
     nothing = np.zeros_like(twin.body.points)
     twin.predict(nothing)
     if is_calibrated(twin):
-        twin.certify(nothing)
+        twin.bound_error(nothing)

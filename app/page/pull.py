@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.registration.verdict import Verdict
-from softtwin.surrogate.certificate import Certificate
+from softtwin.surrogate.error_bound import ErrorBound
 
 from ..twin import Twin
 
@@ -32,7 +32,7 @@ class Prediction:
         displacement: nodal, (n, 3), metres.
         forces: nodal, (n, 3), newtons.
         pull: net force of the pull, (3,), newtons.
-        certificate: how wrong the displacement may be; None where the network was never calibrated.
+        error_bound: how wrong the displacement may be; None where the network was never calibrated.
         asked: when the mouse was there, seconds of the monotonic clock.
         is_held: whether the mouse is farther away than the organ could follow it.
     """
@@ -40,7 +40,7 @@ class Prediction:
     displacement: Floats
     forces: Floats
     pull: Floats
-    certificate: Certificate | None
+    error_bound: ErrorBound | None
     asked: float
     is_held: bool = False
 
@@ -86,7 +86,7 @@ class Pull:
         for part in _PARTS if self._last is not None else (1.0,):
             before = self._amounts
             found = self._prediction(self._towards(self._reached + part * (wanted - self._reached)), place.at)
-            bound = 0.0 if found.certificate is None else found.certificate.largest
+            bound = 0.0 if found.error_bound is None else found.error_bound.largest
             if bound <= self._limit or self._last is None:
                 self._last = found
                 self._reached = self._weights @ found.displacement
@@ -110,16 +110,16 @@ class Pull:
 
     def _prediction(self, state: Any, asked: float) -> Prediction:
         forces = self._forces(self._amounts)
-        certificate = self._twin.certify(forces, state) if is_calibrated(self._twin) else None
-        return Prediction(state.displacement, forces, (self._basis @ self._amounts).sum(axis=0), certificate, asked)
+        error_bound = self._twin.bound_error(forces, state) if is_calibrated(self._twin) else None
+        return Prediction(state.displacement, forces, (self._basis @ self._amounts).sum(axis=0), error_bound, asked)
 
     def _advance(self, step: Floats, state: Any) -> Any:
         """The state after as much of a step as leaves the load where the network says something; moves there."""
         for part in (1.0, 0.5, 0.25, 0.1):
             amounts = self._amounts + part * step
             reached: Any = self._twin.predict(self._forces(amounts))
-            extent = reached.extent
-            if extent is None or extent <= _EXTENT or extent <= state.extent:
+            extent = reached.extrapolation_ratio
+            if extent is None or extent <= _EXTENT or extent <= state.extrapolation_ratio:
                 self._amounts = amounts
                 return reached
         return state
@@ -130,14 +130,14 @@ class Pull:
 
 def judged(found: Prediction) -> tuple[Verdict, str]:
     """The verdict on a prediction by its certificate, and why it is not accepted."""
-    certificate = found.certificate
-    if certificate is None:
+    error_bound = found.error_bound
+    if error_bound is None:
         return Verdict.DOUBTFUL, "no certificate: this twin was never calibrated"
     if found.is_held:
         return Verdict.DOUBTFUL, "it follows no farther: what the network says beyond this pull is worth nothing"
-    if certificate.is_inside and np.isfinite(certificate.largest):
+    if error_bound.is_inside and np.isfinite(error_bound.largest):
         return Verdict.ACCEPTED, ""
-    return Verdict.DOUBTFUL, next(iter(certificate.reasons), "nothing can be said of its error")
+    return Verdict.DOUBTFUL, next(iter(error_bound.reasons), "nothing can be said of its error")
 
 
 def usual_loads(twin: Twin, held: Floats, displacement: Floats, response: Floats) -> Floats:
@@ -152,7 +152,7 @@ def usual_loads(twin: Twin, held: Floats, displacement: Floats, response: Floats
         displacement: nodal, (n, 3), metres.
         response: gradient of the place's movement by the forces, (3, n, 3), metres a newton.
     """
-    maps = twin.model.maps  # type: ignore[attr-defined]
+    maps = twin.model.encoder_decoder  # type: ignore[attr-defined]
     near = (patch(twin, held, displacement, _REACH) > 0.0)[maps.loaded]
     rows = np.repeat(near, 3)
     gradient = response[:, maps.loaded].reshape(3, -1)[:, rows]
@@ -169,7 +169,7 @@ def usual_loads(twin: Twin, held: Floats, displacement: Floats, response: Floats
 
 def _moved_by(state: Any, weights: Floats) -> Floats:
     """Gradient of the weighted displacement by the nodal forces, (3, n, 3), metres a newton."""
-    return np.stack([state.pull(np.outer(weights, axis)) for axis in np.eye(3)])
+    return np.stack([state.vjp(np.outer(weights, axis)) for axis in np.eye(3)])
 
 
 def patch(twin: Twin, held: Floats, displacement: Floats, relative: float) -> Floats:
@@ -181,7 +181,7 @@ def patch(twin: Twin, held: Floats, displacement: Floats, relative: float) -> Fl
         displacement: nodal, (n, 3), metres.
         relative: radius of the patch, relative to the body's size.
     """
-    body, loaded = twin.body, twin.model.maps.loaded  # type: ignore[attr-defined]
+    body, loaded = twin.body, twin.model.encoder_decoder.loaded  # type: ignore[attr-defined]
     away = np.linalg.norm(body.points[loaded] + displacement[loaded] - held, axis=1)
     radius = max(relative * body.size, 1.5 * float(away.min()))
     shares = np.zeros(len(body.points))

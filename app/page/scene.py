@@ -14,7 +14,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import outer, target_points
 
 from ..record import NOTICE
-from .bands import COLOURS, UNTOLD, Colour, Scale, banded
+from .bands import COLOURS, UNINFORMED, Colour, Scale, banded
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -65,7 +65,7 @@ class Picture:
         self._cloud_size = cloud_size
         self._look()
         rest = self.placed(self._outer.rest.points[self._shown])
-        self._bands = [self._band(number, rest, colour) for number, colour in enumerate((UNTOLD, *COLOURS))]
+        self._bands = [self._band(number, rest, colour) for number, colour in enumerate((UNINFORMED, *COLOURS))]
         self._drawn = [np.zeros((0, 3), dtype=np.int64) for _ in self._bands]
         self._inner = {name: self._structure(name, body.inner[name].triangles) for name in body.inner}
         self._labels = {name: self._label(name) for name in body.inner}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from softtwin.registration.pose import Pose
 from softtwin.registration.result import Registration
 
-from ..record import askew_of
+from ..record import pose_correction_of
 from ..register import registered
 from ..streams import Arrival, Mailbox, fed
 from ..twin import Camera, Frame, Home, Sequence, Twin
@@ -43,7 +43,7 @@ class Session:
         home: of the twin.
         is_simulated: whether a simulated camera gives the clouds, with the truth beside them.
         options: entries of [registration] that replace the twin's.
-        camera: where the camera stands; a simulated one that is set askew is looked for near where it should be.
+        camera: where the camera stands; a simulated one that is misaligned is looked for near where it should be.
         engine: that registers to begin with; the first that this machine can run if not given.
     """
 
@@ -164,12 +164,12 @@ class Session:
 
     def _sequence(self, wishes: Wishes) -> Sequence:
         """The sequence of the engine and pose that are asked for; opened anew where those have changed."""
-        wanted = wishes.engine, wishes.view.is_askew
+        wanted = wishes.engine, wishes.view.is_misaligned
         if self._kept is not None and self._kept[0] == wanted:
             return self._kept[1]
         same = self._kept is not None and self._kept[0][0] == wanted[0]
         twin = self._kept[1].twin if same and self._kept is not None else self._opened(wishes.engine)
-        camera = twin.near(Pose.identity()) if wishes.view.is_askew else self._camera
+        camera = twin.near(Pose.identity()) if wishes.view.is_misaligned else self._camera
         self._kept = wanted, Sequence(twin, None, camera)
         self._answered.clear()
         return self._kept[1]
@@ -185,13 +185,13 @@ class Session:
         reason = judgement.reasons[0] if judgement.reasons else ""
         if found is None:
             self._figures = replace(
-                self._figures, verdict=judgement.verdict, reason=reason, margins={}, errors={}, askew=None
+                self._figures, verdict=judgement.verdict, reason=reason, margins={}, errors={}, pose_correction=None
             )
             self.controls.show(self._figures)
             return
         self._forces = found.forces
         margins, errors = margins_of(twin, found), errors_of(twin, found, shot.truth)
-        off = askew_of(found)
+        off = pose_correction_of(found)
         self._figures = replace(
             self._figures,
             verdict=judgement.verdict,
@@ -201,7 +201,7 @@ class Session:
             net_force=float(np.linalg.norm(found.net_force)),
             net_force_deviation=float(np.linalg.norm(found.net_force_deviation)),
             true_net_force=np.nan if shot.net_force is None else float(np.linalg.norm(shot.net_force)),
-            askew=None if off is None or not off["is_seen"] else (off["shift_m"], off["turn_rad"]),
+            pose_correction=None if off is None or not off["is_seen"] else (off["translation_m"], off["rotation_rad"]),
         )
         self.brush.glide(found.displacement)
         self._paint(found, frame, shot, wishes, twin)
@@ -226,7 +226,7 @@ class Session:
             self.hand.let_go(event.client_id)
 
     def _show_prediction(self, found: Prediction) -> None:
-        certificate, (verdict, reason) = found.certificate, judged(found)
+        error_bound, (verdict, reason) = found.error_bound, judged(found)
         self.picture.show_cloud(None)
         self.controls.describe("movement")
         self.picture.paint(np.linalg.norm(found.displacement, axis=1), SCALES["movement"])
@@ -236,8 +236,8 @@ class Session:
                 "forward prediction of a pull, with its certificate",
                 verdict,
                 reason,
-                bound=np.nan if certificate is None else certificate.largest,
-                confidence=np.nan if certificate is None else certificate.confidence,
+                bound=np.nan if error_bound is None else error_bound.largest,
+                confidence=np.nan if error_bound is None else error_bound.confidence,
                 net_force=float(np.linalg.norm(found.pull)),
                 frame_time=time.monotonic() - found.asked,
                 dropped=self._dropped,

@@ -9,10 +9,11 @@ from typing import Any
 
 from softtwin.meshes.files import Axes, Unit
 
+from ..address import Address
 from ..config import ConfigError
 from ..record import NOTICE
 from ..register import Scene, Start
-from ..sources import Address, check_idle, watched
+from ..sources import check_idle, watched
 from ..streams import Cloud, Mailbox
 from ..twin import Camera, Home, find_twin
 from .camera import Shot

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.jacobians import missing_jacobians, stored_modes
-from softtwin.reference.data.part import Part
+from softtwin.reference.data.shard import Shard
 from softtwin.reference.ranks import on_first
 from softtwin.surrogate.pod import learned_basis
 
@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 
 def generate_stage(
-    configuration: Path, redo: Sequence[int] = (), again: bool = False, part: Part | None = None
+    configuration: Path, redo: Sequence[int] = (), again: bool = False, part: Shard | None = None
 ) -> DataSet | None:
     """Solve the equilibria of the data set, those of active rounds after the others, and their Jacobians where wanted.
 
@@ -126,7 +126,7 @@ def describe_data(data: DataSet) -> str:
     )
 
 
-def _read(configuration: Path, part: Part | None) -> tuple[Workspace, Body, Any]:
+def _read(configuration: Path, part: Shard | None) -> tuple[Workspace, Body, Any]:
     """The workspace, its body, and what active rounds are made with."""
     space = open_workspace(configuration)
     try:

@@ -6,8 +6,6 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -15,23 +13,20 @@ import numpy as np
 from softtwin.meshes.metrics import nodal_distances
 from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.calibration import CalibrationWarning, calibrate, coverage
-from softtwin.surrogate.course import chosen_device
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
+from softtwin.surrogate.error_indicators import CalibrationError
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.model import Surrogate
-from softtwin.surrogate.physics import Physics
 from softtwin.surrogate.plan import Device, TrainingPlan
-from softtwin.surrogate.reduced import Reduced
-from softtwin.surrogate.registry import ARCHITECTURES
-from softtwin.surrogate.signs import CalibrationError
 from softtwin.surrogate.train import train
 from softtwin.surrogate.twin import load, save
 
-from ..config import ConfigError, TrainingSection, to_toml
+from ..config import ConfigError, to_toml
 from ..inputs import check_trained, current_data, train_inputs, validate_inputs
 from ..workspace import Workspace, locked, timed, write_whole
 from .generate import lacks_jacobians
+from .plan import training_plan
 
 
 def train_stage(space: Workspace, fresh: bool = False, device: Device = "auto", processes: int = 1) -> Surrogate:
@@ -81,48 +76,6 @@ def calibrated(surrogate: Surrogate, data: DataSet) -> Surrogate:
     except CalibrationError as error:
         warnings.warn(f"the twin has no bounds on its errors: {error}", CalibrationWarning, stacklevel=2)
         return surrogate
-
-
-def training_plan(section: TrainingSection, device: Device = "auto", processes: int = 1) -> TrainingPlan:
-    """What [training] asks for.
-
-    Args:
-        section: of the configuration.
-        device: where to train; it is of the machine, and not of the configuration.
-        processes: that train together; likewise.
-
-    Raises:
-        ConfigError: settings that the architecture does not have, or values that it refuses; weights of physics that
-            there are not.
-        ValueError: a GPU is asked for and there is none; fewer GPUs than processes.
-    """
-    kind: Any = ARCHITECTURES[section.architecture]
-    own = {"modes": section.modes, "width": section.width} if kind is Reduced else {}
-    physics = _built("training.physics", Physics, section.physics) if section.physics else None
-    plan = TrainingPlan(
-        architecture=_built("training.settings", kind, {**own, **section.settings}),
-        seconds=section.seconds,
-        epochs=section.epochs or None,
-        seed=section.seed,
-        physics=physics,
-        patience=section.patience or None,
-        precision=section.precision,
-        device=device,
-        processes=processes,
-    )
-    chosen_device(plan)
-    return plan
-
-
-def _built(entry: str, kind: Any, values: Mapping[str, Any]) -> Any:
-    known = [field.name for field in fields(kind)]
-    unknown = sorted(set(values) - set(known))
-    if unknown:
-        raise ConfigError(f"{entry}: expected names among {', '.join(known)}, got {', '.join(unknown)}.")
-    try:
-        return kind(**values)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{entry}: {error}") from error
 
 
 def validate_stage(space: Workspace) -> str:

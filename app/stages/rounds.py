@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.writing import write_chosen
 from softtwin.reference.generate import candidate_loads, plan_from_header, solve_block
-from softtwin.surrogate.acquisition import most_telling
+from softtwin.surrogate.acquisition import most_informative
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.train import train
 from softtwin.surrogate.twin import CARD, load, save
 
 from ..config import Config
 from ..workspace import Workspace
-from .learn import training_plan
+from .plan import training_plan
 
 Floats = NDArray[np.float64]
 _SHARE = 0.25  # of the time to train in the end that a round's network is given
@@ -30,7 +30,7 @@ _SHARE = 0.25  # of the time to train in the end that a round's network is given
 def next_round(config: Config, data: DataSet) -> int | None:
     """Number of the first round whose draws nobody has chosen yet; None where all have been."""
     free = np.flatnonzero(data.chosen < 0)
-    return int(free[0]) * config.samples.ramp // config.samples.chosen if len(free) else None
+    return int(free[0]) * config.samples.load_path // config.samples.chosen if len(free) else None
 
 
 def choose(space: Workspace, data: DataSet, number: int) -> None:
@@ -51,7 +51,7 @@ def choose(space: Workspace, data: DataSet, number: int) -> None:
         training_plan(training), seconds=_SHARE * training.seconds, epochs=None, samples=before, patience=None
     )
     surrogate = train(data, plan)
-    made, each = plan_from_header(data.header), samples.chosen // samples.ramp
+    made, each = plan_from_header(data.header), samples.chosen // samples.load_path
     pool = range(number * each * samples.candidates, (number + 1) * each * samples.candidates)
 
     def forces(candidate: int) -> Floats:
@@ -59,7 +59,7 @@ def choose(space: Workspace, data: DataSet, number: int) -> None:
         return np.asarray(factors[:, None, None] * loads)
 
     known = data.samples("train", before).forces
-    places = most_telling(surrogate, map(forces, pool), each, known)
+    places = most_informative(surrogate, map(forces, pool), each, known)
     save(surrogate, _network(space.data, number))
     write_chosen(space.data, number * each, pool.start + places)
 

@@ -46,7 +46,7 @@ class Discrepancy:
         return Discrepancy(modes, rest, (own + others) / shared if shared > 0.0 else self.places)
 
 
-def discrepancy_of(errors: Floats, body: Body, most: int, bound: float = np.inf) -> tuple[Discrepancy, int]:
+def discrepancy_of(errors: Floats, body: Body, maximum: int, bound: float = np.inf) -> tuple[Discrepancy, int]:
     """The patterns of errors on samples, and how many of the errors were bounded.
 
     What the patterns leave out is measured on samples that they were not made from. Errors far above the others may be
@@ -56,7 +56,7 @@ def discrepancy_of(errors: Floats, body: Body, most: int, bound: float = np.inf)
     Args:
         errors: u* - u over the largest displacement, (s, 3n), dimensionless; neighbours in the list may be alike.
         body: the body.
-        most: most patterns kept.
+        maximum: most patterns kept.
         bound: errors larger than so many times the median count as that.
 
     Raises:
@@ -68,9 +68,9 @@ def discrepancy_of(errors: Floats, body: Body, most: int, bound: float = np.inf)
     left_out = np.zeros_like(missing)
     for fold in range(_FOLDS):
         held = np.arange(len(missing)) * _FOLDS // len(missing) == fold  # whole paths: their samples are alike
-        modes = _modes(missing[~held], most)[0]
+        modes = _modes(missing[~held], maximum)[0]
         left_out[held] = missing[held] - (missing[held] @ modes) @ modes.T
-    modes, sizes = _modes(missing, most)
+    modes, sizes = _modes(missing, maximum)
     rest = np.sqrt((left_out**2).mean(axis=0).reshape(-1, 3).mean(axis=1))
     seen = left_out.reshape(len(missing), -1, 3)[:, outer_nodes(body)]
     return Discrepancy(modes * sizes, rest, _places(seen)), bounded
@@ -92,10 +92,10 @@ def _places(fields: Floats) -> float:
     return max(1.0, float(np.trace(gram) ** 2 / max((gram**2).sum(), 1e-300)))
 
 
-def _modes(missing: Floats, most: int) -> tuple[Floats, Floats]:
+def _modes(missing: Floats, maximum: int) -> tuple[Floats, Floats]:
     """Orthonormal patterns, (3n, m), and the root mean square of the errors along each, (m,)."""
     _, values, patterns = np.linalg.svd(missing, full_matrices=False)
-    kept = slice(0, min(most, int((values > _LEAST_MODE * values[0]).sum())))
+    kept = slice(0, min(maximum, int((values > _LEAST_MODE * values[0]).sum())))
     return np.ascontiguousarray(patterns[kept].T), values[kept] / np.sqrt(len(missing))
 
 
@@ -134,13 +134,13 @@ def read_discrepancy(path: Path | str, body: Body) -> tuple[Discrepancy, dict[st
             found = Discrepancy(held["modes"], held["rest"], float(card["places"]))
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise DiscrepancyError(
-            f"{path} cannot be read ({error}); is it truncated? `softtwin doubt` makes it."
+            f"{path} cannot be read ({error}); is it truncated? `softtwin model-error` makes it."
         ) from error
     if card.get("format") != _FORMAT:
         raise DiscrepancyError(f"{path}: expected format {_FORMAT}, got {card.get('format')}.")
     if card.get("body") != body.fingerprint:
         raise DiscrepancyError(
             f"{path} belongs to another body (fingerprint {str(card.get('body'))[:12]}..., got "
-            f"{body.fingerprint[:12]}...); make it again with `softtwin doubt`."
+            f"{body.fingerprint[:12]}...); make it again with `softtwin model-error`."
         )
     return found, card["made_of"]

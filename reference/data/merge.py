@@ -84,7 +84,7 @@ def _check(sources: Sequence[DataSet], path: Path) -> None:
         if ramps[0] != ramps[1]:
             raise DataSetError(
                 f"merge.sources: expected as many draws of each load path, got {where} with {ramps[1]} and {ramps[0]} "
-                "(samples.ramp); make both with the same."
+                "(samples.load_path); make both with the same."
             )
         if not np.array_equal(other.response.loaded, first.response.loaded):
             raise DataSetError(f"merge.sources: expected the same loaded nodes, got others in {where}.")

@@ -198,7 +198,7 @@ class ReferenceState:
         return self.equilibrium.displacement
 
     @property
-    def extent(self) -> None:
+    def extrapolation_ratio(self) -> None:
         """None: the reference has learned nothing that it could leave."""
 
     @cached_property
@@ -214,7 +214,7 @@ class ReferenceState:
         self.model.take_again(self.material, self.own)
         return self.model.problem
 
-    def push(self, changes: ArrayLike) -> Floats:
+    def jvp(self, changes: ArrayLike) -> Floats:
         """Changes of the displacement, (3n, k), for small changes of the forces, (3n, k).
 
         Raises:
@@ -222,7 +222,7 @@ class ReferenceState:
         """
         return self._problem.apply_inverse(changes, self.equilibrium)
 
-    def push_inputs(self, changes: Sequence[Change]) -> Floats:
+    def jvp_inputs(self, changes: Sequence[Change]) -> Floats:
         """Changes of the displacement, (3n, k), for small changes of parameters and prescribed displacements.
 
         Raises:
@@ -232,7 +232,7 @@ class ReferenceState:
         at = Linearisation(self._problem, self.equilibrium.load, self.equilibrium)
         return np.stack([at.tangent(change).ravel() for change in changes], axis=1)
 
-    def pull(self, cotangent: ArrayLike) -> Floats:
+    def vjp(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3), from the one with respect to the displacement.
 
         It is the adjoint K^-T g at this state (Odot 2023, eq. 6.8-6.10), zero at fixed nodes.
@@ -247,6 +247,6 @@ class ReferenceState:
         given = np.asarray(cotangent, dtype=np.float64)
         shape = self.model.body.points.shape
         if given.ndim not in (2, 3) or given.shape[-2:] != shape:
-            raise ValueError(f"State.pull: expected a cotangent of shape {shape} or (k, *{shape}), got {given.shape}.")
+            raise ValueError(f"State.vjp: expected a cotangent of shape {shape} or (k, *{shape}), got {given.shape}.")
         columns = given.reshape(-1, self.model.body.points.size).T
         return self._problem.apply_inverse(columns, self.equilibrium, transpose=True).T.reshape(given.shape)

@@ -96,7 +96,10 @@ def test_a_fixed_set_far_from_the_boundary_is_said_with_the_distance(capsys, tmp
 
 @pytest.mark.parametrize(
     ("flag", "value", "named"),
-    [("--young-modulus", "-3", "material.young_modulus"), ("--poisson-ratio", "0.5", "material.poisson_ratio")],
+    [
+        ("--young-modulus", "-3", "--young-modulus: expected a finite number > 0, in pascals, got '-3'"),
+        ("--poisson-ratio", "0.5", "--poisson-ratio: expected a finite number > 0 and < 0.5, got '0.5'"),
+    ],
 )
 def test_materials_that_cannot_be_are_named(capsys, tmp_path, sphere, flag, value, named) -> None:
     assert named in build(capsys, tmp_path, sphere, flag, value)

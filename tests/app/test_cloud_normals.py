@@ -21,10 +21,14 @@ from .conftest import pulled, run, seen_cloud
 
 @pytest.fixture(scope="module")
 def seen(plain_twin: Twin) -> np.ndarray:
+    return with_normals(plain_twin, seed=0)
+
+
+def with_normals(twin: Twin, seed: int) -> np.ndarray:
     """A cloud with the normals of the surface that it lies on, (400, 6)."""
-    forces = pulled(plain_twin.body, (0.0, 0.06, -0.2))
-    cloud, u = seen_cloud(plain_twin, forces), plain_twin.predict(forces).displacement
-    observed = SurfaceDistance(plain_twin.body, plain_twin.body.surfaces["observed"])
+    forces = pulled(twin.body, (0.0, 0.06, -0.2))
+    cloud, u = seen_cloud(twin, forces, seed=seed), twin.predict(forces).displacement
+    observed = SurfaceDistance(twin.body, twin.body.surfaces["observed"])
     moved = u[observed.nodes]
     return np.hstack([cloud, observed.facing(observed.match(moved, cloud), moved)])
 
@@ -84,8 +88,16 @@ def test_they_pull_from_files_as_from_arrays(tmp_path: Path, plain_twin: Twin, s
     both = plain_twin.register(seen)
     np.testing.assert_allclose(row["net_force_N"], both.net_force, rtol=1e-9)
     assert not np.allclose(both.net_force, alone.net_force, rtol=1e-9, atol=0.0)
-    assert both.uncertainty.deviation.mean() < alone.uncertainty.deviation.mean()
     assert CloudFile(tmp_path / "cloud.npy", Coordinates(), normals=True).read().shape == (400, 6)
+
+
+def test_they_leave_less_unknown(plain_twin: Twin) -> None:
+    """In the median of clouds: of each, noise and size of the forces are estimated, too, and may come out larger."""
+    clouds = [with_normals(plain_twin, seed) for seed in range(5)]
+    deviations = [
+        [plain_twin.register(given).uncertainty.deviation.mean() for given in (seen, seen[:, :3])] for seen in clouds
+    ]
+    assert np.median([both / alone for both, alone in deviations]) < 1.0
 
 
 def test_they_turn_with_the_camera(plain_twin: Twin, seen: np.ndarray) -> None:

@@ -203,7 +203,9 @@ def test_sets_with_other_numbers_of_draws_a_path_are_refused(tmp_path: Path, ord
     counts = {"train": 1, "validation": 1, "test": 1}
     singly = made(tmp_path / "singly", samples={**counts, "calibration": 12})
     ramps = made(tmp_path / "ramps", seed=1, ramp=8, block=8, samples={**counts, "calibration": 16})
-    with pytest.raises(DataSetError, match=r"as many draws of each load path, got .* with \d and \d \(samples\.ramp\)"):
+    with pytest.raises(
+        DataSetError, match=r"as many draws of each load path, got .* with \d and \d \(samples\.load_path\)"
+    ):
         merge([singly, ramps][::order], tmp_path / "both.zarr")
 
 

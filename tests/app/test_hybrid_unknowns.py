@@ -53,13 +53,13 @@ def test_a_ratio_and_a_pose_are_found_beside_the_forces(small_quickstart: Path) 
     body = read_body(small_quickstart / "body.vtu")
     truth = solved(body, load, 0.40)
     true = Pose.identity().moved(np.array([0.02, -0.01, 0.02, 2e-3, -1e-3, 2e-3]), body.points.mean(axis=0))
-    with Twin.open(small_quickstart, "hybrid", unknowns=("poisson-ratio",)) as twin:
+    with Twin.open(small_quickstart, "hybrid", parameters=("poisson-ratio",)) as twin:
         found = twin.register(true.apply(seen(body, truth)), "", camera=twin.near(Pose.identity()))
         deviation = found.uncertainty.deviation.mean()
     assert found.judgement.verdict is Verdict.ACCEPTED, found.judgement.reasons
     assert found.draft is not None and not found.draft.estimates  # the network knows of no ratio
     (ratio,) = found.estimates
-    assert ratio.interval[0] < 0.40 < ratio.interval[1] and ratio.told > 0.0
+    assert ratio.interval[0] < 0.40 < ratio.interval[1] and ratio.variance_reduction > 0.0
     in_camera = found.pose.apply(body.points + found.displacement) - true.apply(body.points + truth)
     assert np.linalg.norm(in_camera, axis=1).mean() < 2.0 * deviation < 2e-3
     assert score(found, load.sum(axis=0)) < chi2.ppf(0.999, 3)

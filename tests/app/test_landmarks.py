@@ -129,11 +129,13 @@ def test_what_are_no_landmarks_of_the_clouds_is_said_before_the_first(plain_twin
     with pytest.raises(ConfigError, match=r"expected files in .* named like the clouds, such as one\.csv .*found none"):
         MarkFiles.read(body, tmp_path / "marks", METRES, METRES, clouds)
     for files, words in ((clouds, "2 clouds"), (None, "yet to come")):
-        with pytest.raises(ConfigError, match=rf"--marks: expected a folder .* got the file .*{words}"):
+        with pytest.raises(ConfigError, match=rf"--frame-landmarks: expected a folder .* got the file .*{words}"):
             MarkFiles.read(body, other, METRES, METRES, files)
     with pytest.raises(FileError, match=r"expected landmarks that the body has \(m0, .*\), got tip"):
         MarkFiles.read(body, other, METRES, METRES, clouds[:1])
-    with pytest.raises(ConfigError, match=r"--marks: .*expected points on the observed side at rest; point 0 lies"):
+    with pytest.raises(
+        ConfigError, match=r"--frame-landmarks: .*expected points on the observed side at rest; point 0 lies"
+    ):
         MarkFiles({"far": np.ones(3)}, other, METRES).check(plain_twin)
 
 
@@ -144,7 +146,7 @@ def test_a_contact_of_unknown_place_takes_none(seen_body, ends, tmp_path: Path) 
     from softtwin.reference.derivatives.model import ReferenceModel
     from softtwin.reference.solve.problem import Problem
 
-    section = {"zone": "tip", "unknowns": ["contact"], "model": "reference"}
+    section = {"zone": "tip", "parameters": ["contact"], "model": "reference"}
     with Problem(seen_body, NeoHookean(5000.0, 0.45)) as problem:
         twin = Twin(ReferenceModel(problem), Config.model_validate({"registration": section}))
         with pytest.raises(ConfigError, match="landmarks: expected none beside a contact of unknown place"):
@@ -159,5 +161,5 @@ def test_the_command_line_takes_them(capsys, plain_twin, mesh_folder: Path, ends
     write(mesh_folder / "camera.csv", moved(plain_twin, ends, plain_twin.predict(forces).displacement))
     words = ["register", mesh_folder, mesh_folder / "cloud.npy", "--output", mesh_folder / "found"]
     words += ["--model", "reference", "--zone", "tip", "--landmark-deviation", 1e-3]
-    said = run(capsys, *words, "--marks", mesh_folder / "body.csv", mesh_folder / "camera.csv")
+    said = run(capsys, *words, "--frame-landmarks", mesh_folder / "body.csv", mesh_folder / "camera.csv")
     assert "frame   0: accepted" in said and ", 6 landmarks," in said

@@ -10,7 +10,7 @@ pytest.importorskip("torch", reason="torch is absent")
 
 from softtwin.app.chain import make_twin
 from softtwin.app.config import Config, ConfigError, parse_config, to_toml
-from softtwin.app.stages.learn import training_plan
+from softtwin.app.stages.plan import training_plan
 from softtwin.app.workspace import Workspace
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.physics import Physics

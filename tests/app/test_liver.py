@@ -19,7 +19,7 @@ BOUNDS = {"default": 1e-4, "remeshed": 1.5e-3}
 
 
 @pytest.mark.liver
-@pytest.mark.parametrize(("mesh", "fixed"), [("default", 105), ("remeshed", 106)])
+@pytest.mark.parametrize(("mesh", "fixed"), [("default", 105), pytest.param("remeshed", 106, marks=pytest.mark.slow)])
 def test_two_frames_are_registered_from_files(
     liver_folder: Path, tmp_path: Path, capsys, mesh: str, fixed: int
 ) -> None:

@@ -19,12 +19,13 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("pyigtl", reason="pyigtl is absent")
 
 from softtwin.app import openigtlink
+from softtwin.app.address import Address, parse_source
+from softtwin.app.answer import Answer
 from softtwin.app.config import ConfigError
-from softtwin.app.live import Answer, register_live
+from softtwin.app.live import register_live
 from softtwin.app.messages import FIGURES, POSE, Header, MessageError, Speaker, cloud_in, cloud_message, device_names
 from softtwin.app.openigtlink import LIMIT, Link, LinkError
 from softtwin.app.register import Scene
-from softtwin.app.sources import Address, parse_source
 from softtwin.app.streams import Arrival, Mailbox
 from softtwin.app.twin import Sequence, Twin
 from softtwin.meshes.body import Surface
@@ -549,6 +550,6 @@ def test_words_of_the_command_line(mesh_folder: Path, capsys: Any) -> None:
         (("igtl://:18944",), "expected --watch beside a place of OpenIGTLink"),
         (("igtl://:1/x", "--watch"), "source: expected igtl://HOST:PORT"),
         (("tcp://:1", "--watch"), "source: expected a folder or igtl://HOST:PORT"),
-        (("igtl://:18944", "--watch", "--idle", "0"), "--idle: expected a positive time"),
+        (("igtl://:18944", "--watch", "--idle", "0"), "--idle: expected a finite number > 0, in seconds"),
     ):
         assert words in run(capsys, "register", mesh_folder, *arguments, code=2)

@@ -63,9 +63,9 @@ def test_the_camera_has_the_noise_the_share_and_the_pose_that_are_asked(body: Bo
     assert added.std() == pytest.approx(2e-3, rel=4 / np.sqrt(2 * added.size))  # four deviations of such an estimate
     assert len(plain.cloud) == POINTS and len(part.cloud) == round(0.3 * POINTS)
     view = View(0.0, turn=0.1, shift=5e-3)
-    askew = seen(view)
-    assert view.is_askew and not View().is_askew
-    assert np.allclose(pose_of(view, body).inverse().apply(askew.cloud), plain.cloud, atol=1e-12)
+    misaligned = seen(view)
+    assert view.is_misaligned and not View().is_misaligned
+    assert np.allclose(pose_of(view, body).inverse().apply(misaligned.cloud), plain.cloud, atol=1e-12)
     assert pose_of(view, body).angle_to(pose_of(View(), body)) == pytest.approx(0.1)
 
 
@@ -104,9 +104,9 @@ def test_figures_have_their_units_and_what_is_unknown_is_said_to_be() -> None:
     for words in ("doubtful", "a &lt;reason&gt;", "1.2 mm", "0.4 mm", "unknown", "0.50 ± 0.10 N", "40 ms", "60 ms"):
         assert words in text
     assert "nan" not in text and "inf" not in text and "camera" not in text
-    elsewhere = figures_html(Figures("registration", Verdict.ACCEPTED, askew=(3.21e-3, np.deg2rad(1.24))))
+    elsewhere = figures_html(Figures("registration", Verdict.ACCEPTED, pose_correction=(3.21e-3, np.deg2rad(1.24))))
     assert "camera elsewhere by" in elsewhere and "3.2 mm, 1.2°" in elsewhere
-    assert "above 4 mm" in legend_html(SCALES["error"], has_untold=False)
+    assert "above 4 mm" in legend_html(SCALES["error"], has_uninformed=False)
 
 
 def test_the_brush_reaches_the_answer_in_steps_and_rests() -> None:

@@ -43,7 +43,7 @@ def away(twin: Twin, tip: int) -> np.ndarray:
     push = np.zeros((3 * len(twin.body.points), 3))
     push[3 * tip : 3 * tip + 3] = np.eye(3)
     state = twin.predict(np.zeros_like(twin.body.points))
-    return np.linalg.svd(state.push(push)[3 * tip : 3 * tip + 3])[0][:, 0]
+    return np.linalg.svd(state.jvp(push)[3 * tip : 3 * tip + 3])[0][:, 0]
 
 
 def place(millimetres: float, away: np.ndarray) -> Place:

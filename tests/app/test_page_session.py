@@ -1,4 +1,4 @@
-"""A page at work without a browser: clouds of folders and iterators, bad ones, another engine, an askew camera."""
+"""A page at work without a browser: clouds of folders and iterators, bad ones, another engine, a misaligned camera."""
 
 import threading
 from collections.abc import Iterator
@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("viser", reason="viser is absent")
 pytest.importorskip("torch", reason="torch is absent")
 
+from softtwin.app.address import Address
 from softtwin.app.config import ConfigError
 from softtwin.app.page import server as page_server
 from softtwin.app.page.camera import Shot, TrueStates, View, shot
@@ -20,7 +21,6 @@ from softtwin.app.page.figures import Figures
 from softtwin.app.page.session import Session
 from softtwin.app.page.stream import clouds_of, run_live, show
 from softtwin.app.register import Scene
-from softtwin.app.sources import Address
 from softtwin.app.twin import find_twin
 from softtwin.registration.verdict import Verdict
 
@@ -84,10 +84,10 @@ def test_an_iterator_of_clouds_is_shown_without_a_truth(told: list[Figures]) -> 
 def test_a_camera_that_stands_elsewhere_than_was_said_is_told(told: list[Figures]) -> None:
     cloud = next(shots(1)).cloud
     show(PHANTOM, [cloud], browser=False, say=lambda _: None)  # type: ignore[list-item]
-    assert answered(told)[-1].askew is None
+    assert answered(told)[-1].pose_correction is None
     show(PHANTOM, [cloud + np.array([0.0, 0.0, 8e-3])], browser=False, say=lambda _: None)  # type: ignore[list-item]
-    askew = answered(told)[-1].askew
-    assert askew is not None and 2e-3 < askew[0] < 10e-3
+    pose_correction = answered(told)[-1].pose_correction
+    assert pose_correction is not None and 2e-3 < pose_correction[0] < 10e-3
 
 
 @pytest.mark.parametrize(
@@ -120,12 +120,12 @@ def test_the_organ_that_is_shown_is_the_one_that_was_registered(told: list[Figur
     assert found.errors["tumour"] < 2e-3 < np.linalg.norm(TrueStates.read(PHANTOM).at(1.2)[0], axis=1).max()
 
 
-def test_an_askew_camera_is_found(told: list[Figures]) -> None:
+def test_a_misaligned_camera_is_found(told: list[Figures]) -> None:
     view = View(5e-4, turn=np.deg2rad(4.0), shift=5e-3)
     with page_server.serving() as server:
         session = Session(server, find_twin(PHANTOM), is_simulated=True)
         session.controls._sliders[2].value, session.controls._sliders[3].value = 4.0, 5.0
-        assert session.wishes.view.is_askew
+        assert session.wishes.view.is_misaligned
         session.run(slowly(session, shots(2, view), told))
     found = answered(told)[-1]
     assert found.verdict is not Verdict.REFUSED

@@ -15,7 +15,7 @@ from softtwin.app.quickstart import unseen_load
 from softtwin.app.twin import Twin, forward_models
 from softtwin.meshes.files import read_body
 from softtwin.meshes.shapes import liver_phantom
-from softtwin.surrogate.compact import compacted
+from softtwin.surrogate.low_rank import compressed
 from softtwin.surrogate.twin import load, save
 
 ROOT = Path(__file__).parents[2]
@@ -75,10 +75,10 @@ def test_its_true_states_are_equilibria_of_the_reference(maker: Any) -> None:
 
 def test_the_certificate_holds_against_the_reference_on_a_load_of_its_own_kind(maker: Any) -> None:
     with Twin.open(PHANTOM) as twin:
-        modes = twin.model.maps.load_modes  # type: ignore[attr-defined]
+        modes = twin.model.encoder_decoder.load_modes  # type: ignore[attr-defined]
         forces = np.zeros_like(twin.body.points)
-        forces[twin.model.maps.loaded] = 0.5 * modes[:, 0].reshape(-1, 3)  # type: ignore[attr-defined]
-        found, known = twin.predict(forces).displacement, twin.certify(forces)
+        forces[twin.model.encoder_decoder.loaded] = 0.5 * modes[:, 0].reshape(-1, 3)  # type: ignore[attr-defined]
+        found, known = twin.predict(forces).displacement, twin.bound_error(forces)
         with forward_models("reference", PHANTOM, twin.body, twin.config) as (model, _):
             truth = model.solve(forces).displacement
     error = np.linalg.norm(found - truth, axis=1).max()
@@ -90,20 +90,24 @@ def test_compacting_and_single_precision_change_what_is_predicted_by_no_more_tha
     body = read_body(PHANTOM / "body.vtu")
     whole = load(PHANTOM, body)
     forces = np.zeros_like(body.points)
-    forces[whole.maps.loaded] = whole.maps.load_modes[:, 1].reshape(-1, 3)  # type: ignore[index]
+    forces[whole.encoder_decoder.loaded] = whole.encoder_decoder.load_modes[:, 1].reshape(-1, 3)  # type: ignore[index]
     truth = whole.solve(forces).displacement
-    same = compacted(whole, rank=whole.maps.left.shape[1], load_modes=12)
+    same = compressed(whole, rank=whole.encoder_decoder.left.shape[1], load_modes=12)
     assert "certificate" not in same.card and same.discrepancy is None
     size = np.abs(truth).max()
     assert np.abs(same.solve(forces).displacement - truth).max() < 100 * SINGLE * size
     save(same, tmp_path, single=True)
     again = load(tmp_path, body)
     assert np.array_equal(again.solve(forces).displacement, same.solve(forces).displacement)  # stored without loss
-    fewer = compacted(whole, rank=6, load_modes=3)
-    assert fewer.maps.left.shape[1] == 6
+    fewer = compressed(whole, rank=6, load_modes=3)
+    assert fewer.encoder_decoder.left.shape[1] == 6
     assert 100 * SINGLE * size < np.abs(fewer.solve(forces).displacement - truth).max() < size
-    total = np.square(whole.maps.load_modes).sum() + whole.maps.load_rest[0] * len(whole.maps.load_modes)  # type: ignore[arg-type,index]
-    kept = np.square(fewer.maps.load_modes).sum() + fewer.maps.load_rest[0] * len(fewer.maps.load_modes)  # type: ignore[arg-type,index]
+    total = np.square(whole.encoder_decoder.load_modes).sum() + whole.encoder_decoder.load_rest[0] * len(
+        whole.encoder_decoder.load_modes
+    )  # type: ignore[arg-type,index]
+    kept = np.square(fewer.encoder_decoder.load_modes).sum() + fewer.encoder_decoder.load_rest[0] * len(
+        fewer.encoder_decoder.load_modes
+    )  # type: ignore[arg-type,index]
     assert kept == pytest.approx(total, rel=1e-5)  # what is not kept as a direction is spread
     with pytest.raises(ValueError, match=r"compacted.rank: expected at least 1"):
-        compacted(whole, 0, 1)
+        compressed(whole, 0, 1)

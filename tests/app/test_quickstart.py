@@ -81,6 +81,7 @@ def test_the_card_says_what_the_twin_is(made: Path) -> None:
     assert card["held_out"]["samples"] > 0
 
 
+@pytest.mark.chain
 def test_running_again_makes_nothing_twice(copy: Path, capsys) -> None:
     """The second run finds mesh and equilibria: their files keep their times."""
     stamps = {path: path.stat().st_mtime_ns for path in (copy / "body.vtu", copy / "data.zarr" / "zarr.json")}
@@ -111,7 +112,7 @@ def test_the_hybrid_engine_is_nearer_and_surer_than_the_network(copy: Path, caps
     rows = {}
     for engine in ("surrogate", "hybrid"):
         folder = copy / f"by-{engine}"
-        arguments = ("register", copy, cloud, "--engine", engine, "--truth", copy / "truth.npy", "--output", folder)
+        arguments = ("register", copy, cloud, "--model", engine, "--truth", copy / "truth.npy", "--output", folder)
         assert softtwin(*arguments) == 0
         record = json.loads((folder / "registration.json").read_text())
         assert record["options"]["model"] == engine
@@ -134,6 +135,7 @@ def test_the_hybrid_engine_is_nearer_and_surer_than_the_network(copy: Path, caps
     assert "tumour moved" in capsys.readouterr().out
 
 
+@pytest.mark.chain
 def test_validate_and_report_run_alone(copy: Path, capsys) -> None:
     assert softtwin("validate", copy / "organ.toml") == 0
     assert "cosine of J^T g" in capsys.readouterr().out

@@ -26,7 +26,7 @@ from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.files import FileError, read_body, write_body
 from softtwin.registration.pose import Pose
-from softtwin.registration.unknowns import PosePrior
+from softtwin.registration.priors import PosePrior
 
 from .conftest import pulled, run, seen_cloud
 
@@ -164,10 +164,10 @@ def test_landmarks_are_each_in_their_own_unit(tmp_path: Path, rng) -> None:
     ],
 )
 def test_a_start_is_an_unknown_unless_said_otherwise(plain_twin: Twin, wanted: str, given: bool, kind: type) -> None:
-    twin = Twin(plain_twin.model, Config.model_validate({"registration": {"pose": wanted, "pose_turn": 2.0}}))
+    twin = Twin(plain_twin.model, Config.model_validate({"registration": {"pose": wanted, "pose_rotation": 2.0}}))
     camera = camera_of(twin, Pose.identity() if given else None)
     assert type(camera) is kind
-    assert not isinstance(camera, PosePrior) or camera.turn == pytest.approx(np.deg2rad(2.0))
+    assert not isinstance(camera, PosePrior) or camera.rotation_deviation == pytest.approx(np.deg2rad(2.0))
 
 
 # --- What is written.
@@ -177,10 +177,10 @@ def test_a_start_is_an_unknown_unless_said_otherwise(plain_twin: Twin, wanted: s
 def test_a_camera_that_is_seen_to_stand_elsewhere_is_said(plain_twin: Twin, cloud, tmp_path: Path, off: float) -> None:
     lines: list[str] = []
     (row,) = register_clouds(plain_twin, [cloud + off * np.array([0.0, 0.6, 0.8])], tmp_path, say=lines.append)
-    assert row["askew"]["is_seen"] == (off > 0.0)
+    assert row["pose_correction"]["is_seen"] == (off > 0.0)
     assert ("degrees from where it was said" in lines[0]) == (off > 0.0)
     if off:
-        assert 0.2 * off < row["askew"]["shift_m"] < 2.0 * off
+        assert 0.2 * off < row["pose_correction"]["translation_m"] < 2.0 * off
 
 
 def test_every_frame_is_written_with_its_verdict(plain_twin: Twin, cloud, forces, tmp_path: Path) -> None:
@@ -346,14 +346,14 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
         "smoothness": 0.0,
         "directions": 9,
         "points": 150,
-        "rounds": 1,
+        "reweighting_rounds": 1,
         "solver": "l-bfgs",
         "max_iterations": 60,
         "pose": "fixed",
-        "pose_turn": 3.0,
-        "pose_shift": 0.02,
-        "known_turn": 0.5,
-        "known_shift": 1e-3,
+        "pose_rotation": 3.0,
+        "pose_translation": 0.02,
+        "known_rotation": 0.5,
+        "known_translation": 1e-3,
         "landmark_deviation": 1e-3,
         "penalty": "amplitude",
         "alpha": 0.2,
@@ -365,7 +365,7 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
     flags = [word for name, value in wanted.items() for word in (f"--{name.replace('_', '-')}", value)]
     register(capsys, mesh_folder, mesh_cloud, *flags, "--noise-known", "--format", "ply", "--format", "stl")
     record = record_of(mesh_folder / "found")
-    unused = {"forces": "unknown", "unknowns": [], "known_forces": "", "gravity": [0.0, 0.0, 0.0], "pressure": 0.0}
+    unused = {"forces": "unknown", "parameters": [], "known_forces": "", "gravity": [0.0, 0.0, 0.0], "pressure": 0.0}
     unused |= {"distance": "surface", "normals": False, "normal_deviation": 10.0, "budget": 0.0}
     assert record["options"] == {"model": "reference", "noise_known": True, **wanted, **unused}
     assert record["frames"][0]["points"] <= 150
@@ -385,7 +385,7 @@ def test_a_budget_bounds_each_frame_of_a_sequence(capsys, mesh_folder: Path, mes
     assert [frame["outcome"] for frame in short + long] == ["out_of_time"] * 2 + ["converged"] * 2
     assert short[0]["evaluations"] < long[0]["evaluations"] and short[0]["rms_distance_m"] > long[0]["rms_distance_m"]
     said = register(capsys, mesh_folder, mesh_cloud, "--budget", 0, code=2)
-    assert "--budget: expected a positive time in seconds, got 0.0" in said
+    assert "--budget: expected a finite number > 0, in seconds, got '0'" in said
 
 
 def test_strict_ends_with_code_3(capsys, mesh_folder: Path, mesh_cloud: Path) -> None:
@@ -401,10 +401,16 @@ def test_strict_ends_with_code_3(capsys, mesh_folder: Path, mesh_cloud: Path) ->
     [
         (("--zone", "nowhere"), "registration.zone: expected one of"),
         (("--format", "xyz"), "--format: expected vtu, stl, ply, obj, vtp, nrrd, mrk.json, seq.mrb, got xyz"),
-        (("--noise", "-1"), "registration.noise"),
-        (("--pose", "unknown", "--pose-turn", "0"), "registration.pose_turn: Input should be greater than 0"),
-        (("--pose", "unknown", "--pose-shift", "0"), "registration.pose_shift: Input should be greater than 0"),
-        (("--zone", "tip", "--unknown", "moved@tip"), "got tip, all of which moved@ holds"),
+        (("--noise", "-1"), "--noise: expected a finite number > 0, in metres"),
+        (
+            ("--pose", "unknown", "--pose-rotation", "0"),
+            "--pose-rotation: expected a finite number > 0, in degrees, got '0'",
+        ),
+        (
+            ("--pose", "unknown", "--pose-translation", "0"),
+            "--pose-translation: expected a finite number > 0, in metres, got '0'",
+        ),
+        (("--zone", "tip", "--parameter", "moved@tip"), "got tip, all of which moved@ holds"),
         (("--truth", "cloud.npy"), "--truth: expected shape"),
         (("--align", "auto", "--start", "cloud.npy"), "expected one of them"),
         (("--start", "cloud.npy"), "cloud.npy"),

@@ -28,8 +28,8 @@ from softtwin.meshes.files import write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import LinearResponse
 from softtwin.reference.data.writing import create, write_block
-from softtwin.registration.conditions import Estimate
 from softtwin.registration.outcome import Outcome
+from softtwin.registration.parameter_blocks import Estimate
 from softtwin.registration.pose import Pose
 from softtwin.registration.result import Registration
 from softtwin.registration.uncertainty import Uncertainty
@@ -177,10 +177,10 @@ def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[s
                 forces=np.full_like(shape, 0.01),
                 state=state,  # type: ignore[arg-type]
                 correction=np.zeros_like(shape),
-                doubt=1.0,
-                alike=1.0,
+                discrepancy_scale=1.0,
+                inflation_factor=1.0,
                 pose=Pose.identity(),
-                askew=Pose.identity(),
+                pose_correction=Pose.identity(),
                 net_force=np.array([0.0, 0.3, 0.4]),
                 net_force_covariance=1e-4 * np.eye(3),
                 noise=5e-3 if refused else 5e-4,

@@ -24,13 +24,13 @@ from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import NEEDED, DataSet, DataSetError
 from softtwin.reference.data.jacobians import missing_jacobians, read_jacobians
 from softtwin.reference.data.merge import merge
-from softtwin.reference.data.part import Part
+from softtwin.reference.data.shard import Shard
 from softtwin.reference.data.summary import summary
 from softtwin.reference.data.writing import drop_block, write_chosen
 from softtwin.reference.generate import candidate_loads, plan_from_header, ramp_loads, solve_block
-from softtwin.surrogate.acquisition import most_telling, spread_out
+from softtwin.surrogate.acquisition import most_informative, spread_out
+from softtwin.surrogate.error_indicators import CalibrationError, IndicatorReader
 from softtwin.surrogate.model import Surrogate
-from softtwin.surrogate.signs import CalibrationError, SignReader
 from softtwin.surrogate.twin import load
 
 from .conftest import run
@@ -117,14 +117,14 @@ def test_the_loads_least_in_balance_are_taken_and_as_many_as_they_come(made: Wor
     network = load(made.data.parent / "rounds" / "1", data.body)
     pool = [candidate_loads(data, plan, number) for number in range(40)]
     forces = [factors[:, None, None] * loads for loads, factors in pool]
-    reader = SignReader(network)
+    reader = IndicatorReader(network)
     steps = np.array([reader.read(each[0], network.solve(each[0])).step for each in forces])
-    places = most_telling(network, forces, 5, data.samples("train", 6).forces)
+    places = most_informative(network, forces, 5, data.samples("train", 6).forces)
     assert len(set(places)) == 5
     assert set(places[::2]) <= set(np.argsort(-steps)[:12])
     assert places[1::2].tolist() == [place for place in range(5) if place not in places[::2]][:2]
     with pytest.raises(ValueError, match="candidates: expected at least 41, got 40"):
-        most_telling(network, forces, 41, data.samples("train", 6).forces)
+        most_informative(network, forces, 41, data.samples("train", 6).forces)
 
 
 def test_points_are_spread_out_from_what_is_taken() -> None:
@@ -171,6 +171,7 @@ def test_a_round_that_is_not_chosen_yet_is_chosen(copied: Workspace, tmp_path: P
 
 
 @pytest.mark.mpi
+@pytest.mark.chain
 def test_two_ranks_make_the_rounds_together(tmp_path: Path, mpi_environment: dict[str, str]) -> None:
     space = workspace(tmp_path / "twin")
     command = [
@@ -216,9 +217,9 @@ def test_a_start_from_a_network_ends_in_the_same_states(copied: Workspace) -> No
     np.testing.assert_array_equal(after["reason"], before["reason"])
 
 
-@pytest.mark.parametrize("part", [None, Part(0, 1)], ids=["whole", "part"])
+@pytest.mark.parametrize("part", [None, Shard(0, 1)], ids=["whole", "part"])
 def test_the_stage_asks_the_network_of_its_round(
-    copied: Workspace, monkeypatch: pytest.MonkeyPatch, part: Part | None
+    copied: Workspace, monkeypatch: pytest.MonkeyPatch, part: Shard | None
 ) -> None:
     """For each draw of a round that is solved, and for no other; each asked network is that of its round."""
     data, asked = DataSet(copied.data), []
@@ -261,9 +262,9 @@ def test_a_block_whose_network_is_lost_is_solved_from_rest_and_that_is_said(copi
 def test_rounds_of_a_material_that_torch_does_not_know_say_so(made: Workspace) -> None:
     data = DataSet(made.data)
     network = load(made.data.parent / "rounds" / "1", data.body)
-    network = Surrogate(network.body, network.maps, network.network, {**network.card, "data": {}})
+    network = Surrogate(network.body, network.encoder_decoder, network.network, {**network.card, "data": {}})
     with pytest.raises(CalibrationError, match="material"):
-        most_telling(network, [np.zeros((1, *data.body.points.shape))], 1, data.samples("train", 6).forces)
+        most_informative(network, [np.zeros((1, *data.body.points.shape))], 1, data.samples("train", 6).forces)
 
 
 def test_a_network_of_another_body_is_no_start(made: Workspace, copied: Workspace) -> None:
@@ -300,7 +301,7 @@ def test_a_part_without_torch_says_what_it_does(copied: Workspace, monkeypatch: 
     data = DataSet(copied.data)
     drop_block(copied.data, data.split_draws("active").start // 2)
     with pytest.warns(UserWarning, match=r"part 0/1: samples\.rounds: expected torch .* are solved from rest"):
-        made = generate_stage(copied.root / "organ.toml", part=Part(0, 1))
+        made = generate_stage(copied.root / "organ.toml", part=Shard(0, 1))
     assert made is not None and made.missing_blocks() == []
 
 

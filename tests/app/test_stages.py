@@ -34,7 +34,7 @@ from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.jacobians import stored_modes
 from softtwin.surrogate.calibration import CalibrationWarning
-from softtwin.surrogate.signs import CalibrationError
+from softtwin.surrogate.error_indicators import CalibrationError
 
 ENTRIES = {
     "folder": ".",
@@ -271,7 +271,7 @@ def unsolved(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.parametrize(
     ("flag", "value", "message", "meshed"),
     [
-        ("--ramp", 3, "samples.ramp: expected a divisor of samples.block (8), got 3", False),
+        ("--load-path", 3, "samples.load_path: expected a divisor of samples.block (8), got 3", False),
         ("--displacement", 50.0, "LoadPlan.displacement: expected at most the size of the body", True),
         ("--zone", "tool=fixed.txt", "is on the free boundary", True),
     ],
@@ -303,7 +303,7 @@ def test_one_block_too_many_is_refused(capsys, copy: Path) -> None:
         ("all of the boundary fixed", "expected free nodes on the boundary"),
         ("no body", "softtwin mesh"),
         ("no configuration", "is no TOML"),
-        ("wrong entry", "samples.ramp: expected a divisor"),
+        ("wrong entry", "samples.load_path: expected a divisor"),
     ],
 )
 def test_ranks_end_together_with_one_message(
@@ -377,6 +377,7 @@ def test_two_trainings_in_one_folder_are_one_too_many(copy: Path, monkeypatch: p
         pass  # let go of
 
 
+@pytest.mark.chain
 def test_a_twin_on_a_regular_grid_registers_clouds_of_the_surface(capsys, tmp_path: Path) -> None:
     """`build --grid`: the surface rides in hexahedra, which U-Mesh learns on too; clouds are matched to it."""
     write_files(tmp_path, bar())
@@ -457,15 +458,15 @@ def test_a_twin_says_how_wrong_it_may_be(capsys, tmp_path: Path) -> None:
     assert "calibration  12 accepted" in run(capsys, "data", "show", folder / "organ.toml")
     with Twin.open(folder / "twin") as twin:
         load = np.zeros_like(twin.body.points)
-        load[twin.model.maps.loaded, 2] = 1e-3
-        found = twin.certify(load, twin.predict(load))
+        load[twin.model.encoder_decoder.loaded, 2] = 1e-3
+        found = twin.bound_error(load, twin.predict(load))
         assert 0.0 < found.mean <= found.largest < np.inf
-        assert not twin.certify(1e3 * load).is_inside
+        assert not twin.bound_error(1e3 * load).is_inside
     with (
         Twin.open(folder / "twin", "reference") as twin,
         pytest.raises(CalibrationError, match="a twin with a network"),
     ):
-        twin.certify(load)
+        twin.bound_error(load)
 
 
 def test_too_few_draws_for_a_bound_leave_a_twin_without_one(tmp_path: Path) -> None:
@@ -481,4 +482,4 @@ def test_too_few_draws_for_a_bound_leave_a_twin_without_one(tmp_path: Path) -> N
         Twin.open(folder / "twin") as twin,
         pytest.raises(CalibrationError, match="expected a twin that was calibrated"),
     ):
-        twin.certify(np.zeros_like(twin.body.points))
+        twin.bound_error(np.zeros_like(twin.body.points))

@@ -197,7 +197,7 @@ def test_an_answer_after_its_time_is_late_and_the_best_so_far(plain_twin: Twin, 
 
 @pytest.mark.parametrize("budget", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_budget_is_a_positive_time(plain_twin: Twin, tmp_path: Path, budget: float) -> None:
-    with pytest.raises(ConfigError, match="--budget: expected a positive time in seconds"):
+    with pytest.raises(ConfigError, match="--budget: expected a finite number > 0, in seconds"):
         register_live(plain_twin, Mailbox(), tmp_path, budget=budget)
 
 
@@ -257,7 +257,7 @@ def test_words_that_do_not_go_together_are_refused(mesh_folder: Path, tmp_path: 
     for arguments, words in (
         (("--idle", 1.0), "--idle: expected --watch"),
         (("--watch", "--truth", tmp_path / "file.xyz"), "--watch: expected one folder or igtl://... and no --truth"),
-        (("--watch", "--budget", 0.0), "--budget: expected a positive time"),
+        (("--watch", "--budget", 0.0), "--budget: expected a finite number > 0, in seconds"),
     ):
         assert words in run(capsys, "register", mesh_folder, tmp_path / "file.xyz", *arguments, code=2)
     assert "--idle: " in run(capsys, "register", mesh_folder, tmp_path, "--watch", "--idle", -1.0, code=2)

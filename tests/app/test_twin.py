@@ -91,7 +91,7 @@ def test_a_pose_that_nobody_asks_for_is_known_to_a_few_millimetres(plain_twin: T
         away = np.linalg.norm(found.displacement - truth, axis=1)
         errors[name], covered[name] = away[free].mean(), np.mean(away <= found.uncertainty.margin())
         assert found.pose.distance_to(Pose.identity(), rest) == 0.0
-        found_off = found.askew.distance_to(Pose.identity(), rest)
+        found_off = found.pose_correction.distance_to(Pose.identity(), rest)
         assert (found_off > 0.0) == (name == "as said")
     assert covered["as said"] > 0.9
     if off:
@@ -101,14 +101,18 @@ def test_a_pose_that_nobody_asks_for_is_known_to_a_few_millimetres(plain_twin: T
 
 def test_who_knows_the_pose_exactly_says_so(plain_twin: Twin) -> None:
     said = plain_twin.as_said
-    assert said is not None and said.is_said and (said.turn, said.shift) == pytest.approx((np.deg2rad(1.0), 2e-3))
+    assert (
+        said is not None
+        and said.is_said
+        and (said.rotation_deviation, said.translation_deviation) == pytest.approx((np.deg2rad(1.0), 2e-3))
+    )
     sought = Twin(plain_twin.model, Config.model_validate({"registration": {"pose": "unknown"}})).as_said
-    assert sought is not None and not sought.is_said and sought.shift == pytest.approx(0.01)
+    assert sought is not None and not sought.is_said and sought.translation_deviation == pytest.approx(0.01)
     for entries in (
         {"pose": "fixed"},
-        {"known_turn": 0.0},
-        {"known_shift": 0.0},
-        {"model": "reference", "forces": "known", "gravity": [0.0, 0.0, -9.81], "unknowns": ["young-modulus"]},
+        {"known_rotation": 0.0},
+        {"known_translation": 0.0},
+        {"model": "reference", "forces": "known", "gravity": [0.0, 0.0, -9.81], "parameters": ["young-modulus"]},
     ):
         twin = Twin(plain_twin.model, Config.model_validate({"registration": entries}))
         assert twin.as_said is None

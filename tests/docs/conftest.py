@@ -16,7 +16,7 @@ from mkdocs.__main__ import cli as mkdocs
 
 from softtwin.app.cli import softtwin
 from softtwin.app.config import parse_config
-from softtwin.app.stages.learn import training_plan
+from softtwin.app.stages.plan import training_plan
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

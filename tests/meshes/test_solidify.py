@@ -14,7 +14,7 @@ from softtwin.meshes import tetwild
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.checks import SurfaceError
 from softtwin.meshes.metrics import scaled_jacobians
-from softtwin.meshes.solidify import MOST_NODES, Solid, solidify
+from softtwin.meshes.solidify import MAXIMUM_NODES, Solid, solidify
 
 SIZE = 0.018
 # fTetWild's tolerance about the thinned surface; in its middle a triangle of edge h sags by h^2 / 6R on a sphere of
@@ -151,7 +151,9 @@ def test_a_sheet_is_refused(ball: Surface) -> None:
 def test_a_wrong_unit_is_refused_before_anything_is_made(ball: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "tetrahedra", lambda *_: pytest.fail("fTetWild was started"))
     metres = Surface(1000 * ball.points, ball.triangles)
-    with pytest.raises(ValueError, match=rf"makes about .* nodes, expected at most {MOST_NODES}; is the .*--unit mm"):
+    with pytest.raises(
+        ValueError, match=rf"makes about .* nodes, expected at most {MAXIMUM_NODES}; is the .*--unit mm"
+    ):
         solidify(metres, cell_size=0.01)
 
 

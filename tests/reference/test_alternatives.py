@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.shapes import liver_phantom
-from softtwin.reference.alternatives import Alternatives, differences, forget, shifted
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.generate import Plan, generate
+from softtwin.reference.model_error import ModelErrorEnsemble, differences, forget, shifted
 from softtwin.reference.solve.problem import Problem
 
 PLAN = Plan(
@@ -39,7 +39,7 @@ def test_no_shift_holds_the_same_nodes_and_a_long_one_others(data: DataSet) -> N
 
 def test_an_error_is_the_alternative_less_the_model(data: DataSet) -> None:
     """Poisson's ratio alone, so that the same can be solved here."""
-    found = differences(data.path, Alternatives(poisson_ratio=(0.3, 0.3)), 3)
+    found = differences(data.path, ModelErrorEnsemble(poisson_ratio=(0.3, 0.3)), 3)
     samples, body = data.samples("train"), data.body
     with Problem(body, replace(PLAN, poisson_ratio=0.3).build_material(), PLAN.newton) as problem:
         for error, loads, known in zip(found.errors, samples.forces, samples.displacements, strict=False):
@@ -57,7 +57,7 @@ def test_another_mesh_carries_the_loads_and_the_nodes(data: DataSet) -> None:
     No two meshes are alike (see `solidify`), so nothing is asked of single figures.
     """
     pytest.importorskip("pytetwild")
-    found = differences(data.path, Alternatives(meshes=2), 6)
+    found = differences(data.path, ModelErrorEnsemble(meshes=2), 6)
     lengths = np.linalg.norm(found.errors.reshape(len(found.errors), -1, 3), axis=2)
     assert len(found.errors) > 1  # of the coarser mesh hardly more than three nodes are held
     assert len(list((data.path.parent / "doubt").rglob("mesh_*.vtu"))) == 2
@@ -68,7 +68,7 @@ def test_another_mesh_carries_the_loads_and_the_nodes(data: DataSet) -> None:
     others = found.errors.reshape(-1, 1, *own.shape[1:]) + own  # each on top of every state: one of them is its own
     along = (others * own).sum(axis=(2, 3)) / (np.linalg.norm(others, axis=(2, 3)) * np.linalg.norm(own, axis=(1, 2)))
     assert (along.max(axis=1) > 0.9).all()
-    again = differences(data.path, Alternatives(meshes=2), 6)
+    again = differences(data.path, ModelErrorEnsemble(meshes=2), 6)
     np.testing.assert_array_equal(again.errors, found.errors)
     forget(data.path)
 
@@ -76,8 +76,8 @@ def test_another_mesh_carries_the_loads_and_the_nodes(data: DataSet) -> None:
 def test_another_mesh_of_the_same_cells_changes_nothing(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
     body = data.body
     same = type("Solid", (), {"points": body.points, "cells": body.cells})
-    monkeypatch.setattr("softtwin.reference.alternatives.solidify", lambda surface, node_count: same)
-    found = differences(data.path, Alternatives(meshes=1), 3)
+    monkeypatch.setattr("softtwin.reference.model_error.solidify", lambda surface, node_count: same)
+    found = differences(data.path, ModelErrorEnsemble(meshes=1), 3)
     assert (
         found.failed == 0 and np.abs(found.errors).max() < 1e-5
     )  # of the largest displacement: the solver's tolerance
@@ -85,7 +85,7 @@ def test_another_mesh_of_the_same_cells_changes_nothing(data: DataSet, monkeypat
 
 
 def test_draws_are_the_same_however_often_they_were_interrupted(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = Alternatives(attachment=0.02)
+    asked = ModelErrorEnsemble(attachment=0.02)
     forget(data.path)
     whole = differences(data.path, asked, 6)
     kept = sorted((data.path.parent / "doubt").rglob("*.npy"))
@@ -98,15 +98,15 @@ def test_draws_are_the_same_however_often_they_were_interrupted(data: DataSet, m
 
 
 def test_other_draws_throw_these_away(data: DataSet) -> None:
-    differences(data.path, Alternatives(attachment=0.02), 2)
-    differences(data.path, Alternatives(attachment=0.01), 2)
+    differences(data.path, ModelErrorEnsemble(attachment=0.02), 2)
+    differences(data.path, ModelErrorEnsemble(attachment=0.01), 2)
     assert len(list((data.path.parent / "doubt").iterdir())) == 1
     forget(data.path)
     assert not (data.path.parent / "doubt").exists()
 
 
 def test_what_nothing_holds_counts_as_failed(data: DataSet) -> None:
-    found = differences(data.path, Alternatives(attachment=10.0), 4)  # metres: most shifts leave the organ
+    found = differences(data.path, ModelErrorEnsemble(attachment=10.0), 4)  # metres: most shifts leave the organ
     assert len(found.errors) + found.failed == 4 and found.failed > 0
 
 
@@ -121,15 +121,15 @@ def test_what_nothing_holds_counts_as_failed(data: DataSet) -> None:
 )
 def test_what_cannot_be_asked_is_refused(values: dict[str, object], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        Alternatives(**values)  # type: ignore[arg-type]
+        ModelErrorEnsemble(**values)  # type: ignore[arg-type]
 
 
 def test_bad_requests_are_refused(data: DataSet) -> None:
     with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
-        differences(data.path, Alternatives(attachment=0.01), 0)
+        differences(data.path, ModelErrorEnsemble(attachment=0.01), 0)
 
 
 def test_a_file_of_the_folder_of_draws_is_whole_or_not_there(data: DataSet) -> None:
-    differences(data.path, Alternatives(attachment=0.01), 2)
+    differences(data.path, ModelErrorEnsemble(attachment=0.01), 2)
     names = {path.name for path in Path(data.path.parent / "doubt").rglob("*") if path.is_file()}
     assert names == {"0.npy"}

@@ -75,9 +75,9 @@ def test_push_and_pull_are_differences_of_solves(model: ReferenceModel, rng: np.
     rate = (ahead - back) / 2
     # Central differences err by the cube of the step: (1e-3 N of 0.4 N)^2 of the rate, and a factor for its bends.
     np.testing.assert_allclose(
-        state.push(change.reshape(-1, 1)).reshape(-1, 3), rate, atol=1e-4 * np.abs(rate).max(), rtol=0.0
+        state.jvp(change.reshape(-1, 1)).reshape(-1, 3), rate, atol=1e-4 * np.abs(rate).max(), rtol=0.0
     )
-    slope = float((state.pull(cotangent) * change).sum())
+    slope = float((state.vjp(cotangent) * change).sum())
     scale = np.linalg.norm(cotangent) * np.linalg.norm(rate)
     assert slope == pytest.approx(float((cotangent * rate).sum()), abs=1e-4 * scale)
 
@@ -88,9 +88,9 @@ def test_states_used_by_turns_are_right(model: ReferenceModel, rng: np.random.Ge
     forces = tip_force(model.body)
     states = [model.solve(forces), bare.solve(forces), model.solve(0.5 * forces)]
     changes = rng.standard_normal((forces.size, 2))
-    first = [state.push(changes) for state in states]
+    first = [state.jvp(changes) for state in states]
     for state, pushed in zip(states[::-1], first[::-1], strict=True):
-        np.testing.assert_allclose(state.push(changes), pushed, rtol=0.0, atol=1e-11 * np.abs(pushed).max())
+        np.testing.assert_allclose(state.jvp(changes), pushed, rtol=0.0, atol=1e-11 * np.abs(pushed).max())
 
 
 def test_near_starts_and_cold_ones_meet(model: ReferenceModel) -> None:
@@ -168,7 +168,7 @@ def test_a_following_state_is_found_with_the_factorisation_of_the_one_before(box
     with Problem(box, NeoHookean(5000.0, 0.4)) as problem:
         model = ReferenceModel(problem)
         state = model.solve(tip_force(box, 0.4))
-        state.push(tip_force(box).reshape(-1, 1))  # factored there
+        state.jvp(tip_force(box).reshape(-1, 1))  # factored there
         near, alone = model.solve(tip_force(box, 0.402), near=state), model.solve(tip_force(box, 0.402))
     assert isinstance(near, ReferenceState)
     assert near.equilibrium.factorisations == 0 < alone.equilibrium.factorisations
@@ -252,7 +252,7 @@ def test_a_state_of_another_material_has_no_derivatives_here(box: Body) -> None:
         state = ReferenceModel(problem).solve(tip_force(box))
         problem.set_material(NeoHookean(6000.0, 0.4))
         with pytest.raises(RuntimeError, match=r"expected the material that it was found with.*solve again"):
-            state.pull(state.displacement)
+            state.vjp(state.displacement)
 
 
 def test_a_closed_problem_says_so(box: Body) -> None:
@@ -262,9 +262,9 @@ def test_a_closed_problem_says_so(box: Body) -> None:
     problem.close()
     assert problem.body is box
     for use in (
-        lambda: state.push(np.zeros((box.points.size, 1))),
-        lambda: state.pull(state.displacement),
-        lambda: state.push_inputs([Change(parameters={"young_modulus": 1.0})]),
+        lambda: state.jvp(np.zeros((box.points.size, 1))),
+        lambda: state.vjp(state.displacement),
+        lambda: state.jvp_inputs([Change(parameters={"young_modulus": 1.0})]),
         lambda: state.negative_pivots,
         lambda: problem.solve(tip_force(box)),
         lambda: problem.set_material(NeoHookean(6000.0, 0.4)),
@@ -282,16 +282,16 @@ def test_inputs_are_a_models_own_again_when_none_are_given(box: Body) -> None:
         with Problem(box, NeoHookean(2500.0, 0.4), EXACT) as other:
             alone = ReferenceModel(other).solve(forces)
             np.testing.assert_allclose(soft.displacement, alone.displacement, atol=1e-9)
-            wanted = alone.pull(alone.displacement)
+            wanted = alone.vjp(alone.displacement)
         again = model.solve(forces)
         np.testing.assert_allclose(again.displacement, own.displacement, atol=1e-9)
-        np.testing.assert_allclose(soft.pull(soft.displacement), wanted, atol=1e-6 * np.abs(wanted).max())
+        np.testing.assert_allclose(soft.vjp(soft.displacement), wanted, atol=1e-6 * np.abs(wanted).max())
         np.testing.assert_allclose(model.solve(forces).displacement, own.displacement, atol=1e-9)
         with pytest.raises(ValueError, match=r"ReferenceModel\.inputs: expected parameters among .*stiffness"):
             model.solve(forces, None, Inputs({"stiffness": 1.0}))
         problem.set_material(NeoHookean(6000.0, 0.4))
         with pytest.raises(RuntimeError, match="expected the material that it was found with"):
-            soft.pull(soft.displacement)
+            soft.vjp(soft.displacement)
 
 
 @pytest.mark.liver
@@ -320,5 +320,5 @@ def test_a_tool_that_lets_go_of_the_liver_and_takes_it_again_is_no_long_way(live
 def test_cotangents_of_another_shape_are_refused(box: Body, shape: tuple[int, ...]) -> None:
     with Problem(box, NeoHookean(5000.0, 0.4)) as problem:
         state = ReferenceModel(problem).solve(tip_force(box))
-        with pytest.raises(ValueError, match=r"State\.pull: expected a cotangent of shape"):
-            state.pull(np.zeros(shape))
+        with pytest.raises(ValueError, match=r"State\.vjp: expected a cotangent of shape"):
+            state.vjp(np.zeros(shape))

@@ -22,7 +22,7 @@ class CantileverState:
     mean: np.ndarray
     reach: float
     negative_pivots: int | None = None
-    extent: float | None = None
+    extrapolation_ratio: float | None = None
 
     @property
     def displacement(self) -> np.ndarray:
@@ -32,12 +32,12 @@ class CantileverState:
     def _slope(self) -> np.ndarray:
         return self.reach * (1.0 - np.tanh(self.mean) ** 2)
 
-    def push(self, changes: ArrayLike) -> np.ndarray:
+    def jvp(self, changes: ArrayLike) -> np.ndarray:
         moved = np.asarray(changes).reshape(len(self.shape), 3, -1)
         mean = np.einsum("n,nik->ik", self.shape, moved)
         return np.einsum("n,i,ik->nik", self.shape, self._slope, mean).reshape(-1, moved.shape[2])
 
-    def pull(self, cotangent: ArrayLike) -> np.ndarray:
+    def vjp(self, cotangent: ArrayLike) -> np.ndarray:
         return self.shape[:, None] * self._slope * (self.shape @ np.asarray(cotangent))
 
 
@@ -59,8 +59,8 @@ class Cantilever:
         size = float(np.abs(mean).max())
         if size > self.refuse_above:
             raise NotConverged("too large a step for the test model")
-        extent = None if self.learned is None else size / self.learned
-        return CantileverState(self._shape, mean, 0.2, extent=extent)
+        extrapolation_ratio = None if self.learned is None else size / self.learned
+        return CantileverState(self._shape, mean, 0.2, extrapolation_ratio=extrapolation_ratio)
 
 
 def seen_from_above(cells: tuple[int, int, int] = (8, 3, 3)) -> Body:

@@ -7,10 +7,10 @@ import pytest
 from scipy.sparse import csr_array, eye
 
 from softtwin.meshes.body import Body
-from softtwin.registration.anchored import Anchored
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
-from softtwin.registration.unknowns import nodal_forces
+from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.manifold_mapping import ManifoldMapping
+from softtwin.registration.priors import nodal_forces
 
 from .conftest import Cantilever, tip_forces
 from .test_engines import Bent
@@ -19,18 +19,18 @@ NET = (0.0, 0.3, -0.8)
 
 
 @pytest.fixture
-def anchored(body: Body) -> tuple[Anchored, object, np.ndarray]:
+def anchored(body: Body) -> tuple[ManifoldMapping, object, np.ndarray]:
     """The moved model, the exact one and the anchor, for a fast model that moves a third too far."""
     nodes = np.flatnonzero(body.points[:, 2] > 0.199)
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 2.0, least=1e-4))
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 2.0, minimum=1e-4))
     fast, exact = (reduce_model(model, nodes, forces.basis) for model in (Bent(body, 1.3), Cantilever(body)))
-    anchor = forces.nearest(tip_forces(body, NET))
-    return Anchored.at(fast, nodes, anchor, exact.solve(anchor)), exact, anchor
+    expansion_point = forces.nearest(tip_forces(body, NET))
+    return ManifoldMapping.at(fast, nodes, expansion_point, exact.solve(expansion_point)), exact, expansion_point
 
 
 def test_it_is_the_exact_model_at_the_anchor(anchored) -> None:
-    moved, exact, anchor = anchored
-    there, wanted = moved.solve(anchor), exact.solve(anchor)
+    moved, exact, expansion_point = anchored
+    there, wanted = moved.solve(expansion_point), exact.solve(expansion_point)
     every = csr_array(eye(wanted.positions.size))
     np.testing.assert_allclose(there.positions, wanted.positions, atol=1e-14)
     np.testing.assert_allclose(there.jacobian(every), wanted.jacobian(every), atol=1e-14)
@@ -38,11 +38,14 @@ def test_it_is_the_exact_model_at_the_anchor(anchored) -> None:
 
 
 def test_it_leaves_the_exact_model_by_second_order(anchored, rng) -> None:
-    moved, exact, anchor = anchored
+    moved, exact, expansion_point = anchored
     change = 0.3 * rng.standard_normal(moved.count)
     sizes = 2.0 ** -np.arange(1, 6)
     off = [
-        np.abs(moved.solve(anchor + size * change).positions - exact.solve(anchor + size * change).positions).max()
+        np.abs(
+            moved.solve(expansion_point + size * change).positions
+            - exact.solve(expansion_point + size * change).positions
+        ).max()
         for size in sizes
     ]
     orders = np.log2(np.divide(off[:-1], off[1:]))
@@ -51,8 +54,8 @@ def test_it_leaves_the_exact_model_by_second_order(anchored, rng) -> None:
 
 
 def test_its_derivative_is_that_of_its_positions(anchored, rng) -> None:
-    moved, _, anchor = anchored
-    place, change, step = anchor + 0.2, rng.standard_normal(moved.count), 1e-6
+    moved, _, expansion_point = anchored
+    place, change, step = expansion_point + 0.2, rng.standard_normal(moved.count), 1e-6
     at = moved.solve(place)
     every = csr_array(eye(at.positions.size))
     two = [moved.solve(place + sign * step * change).positions for sign in (1.0, -1.0)]
@@ -62,7 +65,7 @@ def test_its_derivative_is_that_of_its_positions(anchored, rng) -> None:
 
 
 def test_combined_directions_are_the_same_model(anchored, rng) -> None:
-    moved, _, anchor = anchored
+    moved, _, expansion_point = anchored
     turn = np.linalg.qr(rng.standard_normal((moved.count, moved.count)))[0]
-    other, place = moved.combined(turn), anchor + 0.1
+    other, place = moved.combined(turn), expansion_point + 0.1
     np.testing.assert_allclose(other.solve(turn.T @ place).positions, moved.solve(place).positions, atol=1e-12)

@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import ArrayLike
 
 from softtwin.meshes.body import Body
-from softtwin.registration.evidence import Scale
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
-from softtwin.registration.options import Gathering, RegistrationOptions
+from softtwin.registration.options import RegistrationOptions, SparseLocalisation
 from softtwin.registration.outcome import Outcome
+from softtwin.registration.priors import nodal_forces
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import nodal_forces
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, CantileverState, cloud_on, tip_forces
@@ -44,10 +44,10 @@ def test_more_time_gives_no_worse_an_answer(body: Body, model: Ticking, rng, sol
     """By the seconds of a model that counts them; what two answers in noise may differ by is their own doubt."""
     truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
     cloud = cloud_on(body, truth, 400, rng, 5e-4)
-    options = RegistrationOptions(gathering=Gathering(rounds=0))
+    options = RegistrationOptions(localisation=SparseLocalisation(rounds=0))
     if solver == "l-bfgs":
-        options = RegistrationOptions(gathering=Gathering(rounds=0), solver=LBFGS())
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 2.0, least=1e-4))
+        options = RegistrationOptions(localisation=SparseLocalisation(rounds=0), solver=LBFGS())
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 2.0, minimum=1e-4))
     registrar = Registrar(model, SurfaceDistance(body, body.surfaces["observed"]), forces, options)
     model.now = 0.0
     whole = registrar.register(cloud)
@@ -71,7 +71,7 @@ def test_more_time_gives_no_worse_an_answer(body: Body, model: Ticking, rng, sol
 def test_a_search_from_rest_that_has_no_time_leaves_the_frame_that_followed(body: Body, model: Ticking, rng) -> None:
     """Noise that jumps may mean that forces act elsewhere now, which only a search from rest would tell."""
     truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 2.0, least=1e-4))
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 2.0, minimum=1e-4))
     registrar = Registrar(model, SurfaceDistance(body, body.surfaces["observed"]), forces, RegistrationOptions())
     quiet, loud = (cloud_on(body, truth, 400, rng, noise) for noise in (3e-4, 1e-3))
     last = registrar.register(quiet)

@@ -13,17 +13,17 @@ from numpy.typing import ArrayLike
 from softtwin.meshes.body import Body
 from softtwin.registration.cloud import Cloud
 from softtwin.registration.correlated import CorrelatedNoise, Linear, find_correlated, is_noise
-from softtwin.registration.evidence import Scale
 from softtwin.registration.gauss_newton import LocalModel
 from softtwin.registration.hybrid import HybridRegistrar
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
-from softtwin.registration.options import Belief, Gathering, RegistrationOptions
+from softtwin.registration.options import ForceHyperprior, RegistrationOptions, SparseLocalisation
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
+from softtwin.registration.priors import PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.result import Registration, badness
-from softtwin.registration.unknowns import PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, CantileverState, cloud_on, seen_from_above, tip_forces
@@ -49,8 +49,8 @@ def shaken(cloud: np.ndarray, rng: np.random.Generator, size: float = SIZE) -> n
 
 
 def registrar(body: Body, pose: PosePrior | None = None, model: Cantilever | None = None) -> Registrar:
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 0.5, least=1e-4))
-    options = RegistrationOptions(gathering=Gathering(rounds=0))
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4))
+    options = RegistrationOptions(localisation=SparseLocalisation(rounds=0))
     return Registrar(
         model or Cantilever(body), SurfaceDistance(body, body.surfaces["observed"]), forces, options, pose=pose
     )
@@ -73,7 +73,7 @@ def linear(data: np.ndarray, points: np.ndarray) -> Linear:
 
 
 def test_its_size_and_length_are_told(rng: np.random.Generator) -> None:
-    noise, force, told = Scale(5e-4, 1.5, least=1e-4), Scale(1e-3, 1.0), []
+    noise, force, told = LogNormalPrior(5e-4, 1.5, minimum=1e-4), LogNormalPrior(1e-3, 1.0), []
     for _ in range(12):
         points = sphere(600, rng)
         along = np.einsum("pi,pi->p", 1e-3 * field(points, 0.03, rng), points / 0.1)
@@ -85,14 +85,14 @@ def test_its_size_and_length_are_told(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("scale", [2e-4, 1e-3])
 def test_noise_of_single_points_is_not_taken_for_it(rng: np.random.Generator, scale: float) -> None:
-    noise, force = Scale(5e-4, 1.5, least=1e-4), Scale(1e-3, 1.0)
+    noise, force = LogNormalPrior(5e-4, 1.5, minimum=1e-4), LogNormalPrior(1e-3, 1.0)
     for _ in range(12):
         points = sphere(600, rng)
         assert find_correlated(linear(scale * rng.standard_normal(600), points), noise, force, 0.0) is None
 
 
 def test_a_spot_and_a_handful_of_points_tell_nothing(rng: np.random.Generator) -> None:
-    noise, force = Scale(5e-4, 1.5, least=1e-4), Scale(1e-3, 1.0)
+    noise, force = LogNormalPrior(5e-4, 1.5, minimum=1e-4), LogNormalPrior(1e-3, 1.0)
     few = sphere(20, rng)
     assert find_correlated(linear(few[:, 0], few), noise, force, -99.0) is None
     assert find_correlated(linear(np.zeros(0), few[:0]), noise, force, -99.0) is None  # all were outliers
@@ -104,11 +104,14 @@ def test_a_noise_that_is_known_is_believed(rng: np.random.Generator) -> None:
     """Told 0.2 mm, the rest is shared."""
     points = sphere(600, rng)
     along = np.einsum("pi,pi->p", 1e-3 * field(points, 0.03, rng), points / 0.1) + OWN * rng.standard_normal(600)
-    found = find_correlated(linear(along, points), Scale(OWN, 0.0), Scale(1e-3, 1.0), 5.0)
+    found = find_correlated(linear(along, points), LogNormalPrior(OWN, 0.0), LogNormalPrior(1e-3, 1.0), 5.0)
     assert found is not None
     assert found[0] == pytest.approx(1e-3, rel=0.25)
     assert (
-        find_correlated(linear(OWN * rng.standard_normal(600), points), Scale(OWN, 0.0), Scale(1e-3, 1.0), 0.0) is None
+        find_correlated(
+            linear(OWN * rng.standard_normal(600), points), LogNormalPrior(OWN, 0.0), LogNormalPrior(1e-3, 1.0), 0.0
+        )
+        is None
     )
 
 
@@ -135,23 +138,25 @@ def test_residuals_have_the_derivative_that_they_say(body: Body, rng: np.random.
     prior = PosePrior(Pose.identity(), body.points.mean(axis=0)) if has_pose else None
     made = registrar(body, prior)
     plain = made.register(shaken(cloud_on(body, truth(body), 300, rng), rng))
-    points, normals = plain.problem.cloud, plain.problem.normals(plain.trial)
-    found = made.believing(CorrelatedNoise.over(points, normals, SIZE, LENGTH)).register(points)
-    problem, at = found.problem, found.trial
+    points, normals = plain.problem.cloud, plain.problem.normals(plain.evaluation)
+    found = made.with_prior(CorrelatedNoise.over(points, normals, SIZE, LENGTH)).register(points)
+    problem, at = found.problem, found.evaluation
     assert problem.correlated is not None
     some = rng.standard_normal(problem.size) * np.where(np.arange(problem.size) < problem.forces.size, 0.01, 0.1)
     cotangent = rng.standard_normal(len(problem.cloud))
     step = 1e-4 * some
-    ahead, behind = (problem.residuals(problem.trial(at.coefficients + sign * step, at), OWN) for sign in (1.0, -1.0))
+    ahead, behind = (
+        problem.residuals(problem.evaluation(at.coefficients + sign * step, at), OWN) for sign in (1.0, -1.0)
+    )
     slope, scale = (ahead - behind) / 2e-4, np.abs(ahead - behind).max() / 2e-4
     # The normals turn with the surface, which the derivative of the shifts along them leaves out: second order.
     assert np.median(np.abs(problem.jacobian(at) @ some - slope)) < 2e-2 * scale
     part = problem.noise_part
     only = np.zeros(problem.size)
     only[part] = some[part]
-    moved = problem.residuals(problem.trial(at.coefficients + only, at), OWN) - problem.residuals(at, OWN)
+    moved = problem.residuals(problem.evaluation(at.coefficients + only, at), OWN) - problem.residuals(at, OWN)
     np.testing.assert_allclose(problem.jacobian(at) @ only, moved, atol=1e-9)
-    pulled = problem.pulled(at, cotangent)
+    pulled = problem.vjp(at, cotangent)
     np.testing.assert_allclose(pulled, problem.jacobian(at).T @ cotangent, rtol=1e-8, atol=1e-9 * np.abs(pulled).max())
 
 
@@ -181,14 +186,16 @@ def test_what_is_shared_over_less_than_the_edges_only_counts_points(rng: np.rand
     assert found.problem.correlated is None and found.looked_for == 1
     again = registrar(coarse).follow(shaken(cloud, rng), found)
     assert again.looked_for == 2  # a frame on
-    assert found.alike > 2.0
+    assert found.inflation_factor > 2.0
 
 
 def test_what_is_larger_than_noise_is_called_so(rng: np.random.Generator) -> None:
     """Two centimetres over three: the size ends at its bound, and stands for what no force explains."""
     points = sphere(600, rng)
     along = np.einsum("pi,pi->p", 2e-2 * field(points, 0.03, rng), points / 0.1)
-    found = find_correlated(linear(along, points), Scale(5e-4, 1.5, least=1e-4), Scale(1e-3, 1.0), 5.0)
+    found = find_correlated(
+        linear(along, points), LogNormalPrior(5e-4, 1.5, minimum=1e-4), LogNormalPrior(1e-3, 1.0), 5.0
+    )
     assert found is not None and not is_noise(found[0])
     assert is_noise(SIZE)
 
@@ -218,9 +225,9 @@ def test_what_no_force_explains_is_doubtful_and_so_are_frames_that_follow(
 
 def test_a_frame_that_is_noisier_keeps_what_is_known_of_the_forces_if_it_is_met_as_well(body: Body) -> None:
     """A clear cloud has told their size; noise tells it to nobody who begins at rest."""
-    scale = Scale(0.005, 0.5, least=1e-5)
+    scale = LogNormalPrior(0.005, 0.5, minimum=1e-5)
     forces = nodal_forces(body, body.node_sets["tip"], scale)
-    options = RegistrationOptions(gathering=Gathering(rounds=0), belief=Belief(clear=2e-4))
+    options = RegistrationOptions(localisation=SparseLocalisation(rounds=0), hyperprior=ForceHyperprior(clear=2e-4))
     made, kept = Registrar(Cantilever(body), SurfaceDistance(body, body.surfaces["observed"]), forces, options), []
     for seed in range(4):
         rng = np.random.default_rng(seed)

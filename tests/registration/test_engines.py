@@ -13,15 +13,15 @@ from numpy.typing import ArrayLike
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.reference.data.outcome import NotConverged
-from softtwin.registration.evidence import Scale
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hybrid import HybridRegistrar
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
+from softtwin.registration.priors import PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar, register_sequence
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, CantileverState, cloud_on, tip_forces
@@ -45,7 +45,7 @@ class Bent(Cantilever):
 def engine(fast: Bent, exact: Bent, pose: PosePrior | None = None) -> HybridRegistrar:
     def alone(model: Bent, options: RegistrationOptions) -> Registrar:
         body = model.body
-        forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 2.0, least=1e-4))
+        forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 2.0, minimum=1e-4))
         return Registrar(model, SurfaceDistance(body, body.surfaces["observed"]), forces, options, pose=pose)
 
     thorough = RegistrationOptions(solver=GaussNewton(settled=0.02))  # to a fiftieth of a deviation

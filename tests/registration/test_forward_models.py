@@ -99,7 +99,7 @@ def test_no_load_is_no_displacement(model: ForwardModel) -> None:
 def test_fixed_nodes_stay_and_feel_nothing(model: ForwardModel, load: np.ndarray, rng) -> None:
     state = model.solve(load)
     assert np.abs(state.displacement[model.body.fixed]).max() == 0.0
-    assert np.abs(state.pull(rng.standard_normal(load.shape))[model.body.fixed]).max() == 0.0
+    assert np.abs(state.vjp(rng.standard_normal(load.shape))[model.body.fixed]).max() == 0.0
 
 
 def test_a_state_is_of_its_forces_alone(model: ForwardModel, load: np.ndarray, other: np.ndarray) -> None:
@@ -124,11 +124,11 @@ def test_states_keep_what_they_are(
     forces, cotangent = load.copy(), rng.standard_normal(load.shape)
     changes = some_changes(data, 2, rng)
     first = model.solve(forces)
-    before = (first.displacement.copy(), first.push(changes), first.pull(cotangent))
+    before = (first.displacement.copy(), first.jvp(changes), first.vjp(cotangent))
     forces[:] = 0.0
     second = model.solve(2.0 * other, near=first)  # so far that its derivatives differ, whichever load was drawn
-    apart = (second.displacement.copy(), second.push(changes), second.pull(cotangent))
-    again = (first.displacement, first.push(changes), first.pull(cotangent))
+    apart = (second.displacement.copy(), second.jvp(changes), second.vjp(cotangent))
+    again = (first.displacement, first.jvp(changes), first.vjp(cotangent))
     for was, now, elsewhere in zip(before, again, apart, strict=True):
         np.testing.assert_allclose(now, was, rtol=0.0, atol=1e-12 * np.abs(was).max())
         assert np.abs(elsewhere - was).max() > 1e-3 * np.abs(was).max()
@@ -144,7 +144,7 @@ def test_pivots_are_counted_or_not_known(model: ForwardModel, load: np.ndarray) 
 @exact
 def test_push_passes_the_taylor_test(model: ForwardModel, load: np.ndarray, direction: np.ndarray) -> None:
     state = model.solve(load)
-    rate = state.push(direction.reshape(-1, 1)).reshape(-1, 3)
+    rate = state.jvp(direction.reshape(-1, 1)).reshape(-1, 3)
     errors = [
         float(
             np.linalg.norm(model.solve(load + h * direction, near=state).displacement - state.displacement - h * rate)
@@ -160,7 +160,7 @@ def test_pull_passes_the_taylor_test(
     target = data.samples("test").displacements[1]
     misfit = lambda forces: 0.5 * float(((model.solve(forces).displacement - target) ** 2).sum())  # noqa: E731
     state = model.solve(load)
-    slope = float((state.pull(state.displacement - target) * direction).sum())
+    slope = float((state.vjp(state.displacement - target) * direction).sum())
     start = misfit(load)
     # Between two kinks of the perceptron the misfit is quadratic: steps short enough not to cross one.
     steps = (1e-4 if "mlp" in request.node.name else 1.0) * 0.5 ** np.arange(1, 5)
@@ -172,8 +172,8 @@ def test_push_and_pull_are_transposes(model: ForwardModel, load: np.ndarray, dat
     forces = np.stack([whole(data, rng.standard_normal((len(data.response.loaded), 3))) for _ in range(3)])
     cotangents = rng.standard_normal((2, *load.shape))
     cotangents[:, model.body.fixed] = 0.0
-    pushed = state.push(forces.reshape(3, -1).T)
-    pulled = state.pull(cotangents)
+    pushed = state.jvp(forces.reshape(3, -1).T)
+    pulled = state.vjp(cotangents)
     assert pushed.shape == (load.size, 3) and pulled.shape == cotangents.shape
     left, right = cotangents.reshape(2, -1) @ pushed, pulled.reshape(2, -1) @ forces.reshape(3, -1).T
     np.testing.assert_allclose(left, right, atol=1e-8 * np.abs(left).max())
@@ -182,10 +182,10 @@ def test_push_and_pull_are_transposes(model: ForwardModel, load: np.ndarray, dat
 def test_many_at_once_are_each_alone(model: ForwardModel, load: np.ndarray, data: DataSet, rng) -> None:
     state = model.solve(load)
     cotangents, changes = rng.standard_normal((3, *load.shape)), some_changes(data, 3, rng)
-    pulled, pushed = state.pull(cotangents), state.push(changes)
+    pulled, pushed = state.vjp(cotangents), state.jvp(changes)
     for i in range(3):
-        np.testing.assert_allclose(state.pull(cotangents[i]), pulled[i], rtol=0.0, atol=1e-9 * np.abs(pulled).max())
-        alone = state.push(changes[:, i : i + 1])[:, 0]
+        np.testing.assert_allclose(state.vjp(cotangents[i]), pulled[i], rtol=0.0, atol=1e-9 * np.abs(pulled).max())
+        alone = state.jvp(changes[:, i : i + 1])[:, 0]
         np.testing.assert_allclose(alone, pushed[:, i], rtol=0.0, atol=1e-9 * np.abs(pushed).max())
 
 
@@ -196,11 +196,11 @@ def test_a_solve_that_fails_leaves_earlier_states_as_they_are(data: DataSet, loa
     with Problem(data.body, PLAN.build_material(), NewtonOptions(max_iterations=8)) as problem:
         model = ReferenceModel(problem, patient=False)
         state = model.solve(load)
-        moved, pulled = state.displacement.copy(), state.pull(state.displacement)
+        moved, pulled = state.displacement.copy(), state.vjp(state.displacement)
         with pytest.raises(NotConverged):
             model.solve(-1e4 * load, near=state)
         assert np.array_equal(state.displacement, moved)
-        np.testing.assert_allclose(state.pull(moved), pulled, rtol=0.0, atol=1e-12 * np.abs(pulled).max())
+        np.testing.assert_allclose(state.vjp(moved), pulled, rtol=0.0, atol=1e-12 * np.abs(pulled).max())
         assert state.negative_pivots == 0
 
 

@@ -63,7 +63,7 @@ def stepped(problem: Problem, load: np.ndarray) -> np.ndarray:
 
 
 def with_random_weights(network: Surrogate) -> Surrogate:
-    other = Surrogate(network.body, network.maps, copy.deepcopy(network.network), network.card)
+    other = Surrogate(network.body, network.encoder_decoder, copy.deepcopy(network.network), network.card)
     chance = np.random.default_rng(0)
     for weights in other.network.parameters():
         drawn = weights.numpy().std() * chance.standard_normal(tuple(weights.shape))

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.inputs import Change, Inputs
-from softtwin.registration.conditions import Conditions, PoissonRatio, Stiffness
-from softtwin.registration.identifiability import untold
+from softtwin.registration.identifiability import uninformed
+from softtwin.registration.parameter_blocks import ParameterBlocks, PoissonRatio, YoungModulus
 from softtwin.registration.registrar import prepare
 from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Verdict
@@ -31,17 +31,17 @@ class TwoSprings:
     parts: tuple[float, float]
     moduli: np.ndarray
     negative_pivots: int | None = None
-    extent: float | None = None
+    extrapolation_ratio: float | None = None
 
     @property
     def displacement(self) -> np.ndarray:
         stretch = sum(part * MODULUS / self.moduli[own[0]] for part, own in zip(self.parts, self.cells, strict=True))
         return PULL * stretch * self.shape[:, None] * np.array([0.0, 0.0, -1.0])
 
-    def push(self, changes: ArrayLike) -> np.ndarray:
+    def jvp(self, changes: ArrayLike) -> np.ndarray:
         return np.zeros_like(np.asarray(changes))
 
-    def push_inputs(self, changes: list[Change]) -> np.ndarray:
+    def jvp_inputs(self, changes: list[Change]) -> np.ndarray:
         found = np.zeros((self.shape.size * 3, len(changes)))
         for place, change in enumerate(changes):
             slopes = change.parameters["young_modulus"]
@@ -73,20 +73,20 @@ def halves(body: Body) -> tuple[np.ndarray, np.ndarray]:
 
 def registered(body: Body, parts: tuple[float, float], unknowns: tuple, rng: np.random.Generator) -> Registration:
     model = SpringModel(body, parts)
-    conditions = Conditions(body, {"young_modulus": np.full(len(body.cells), MODULUS)}, unknowns)
-    registrar = prepare(model, None, body.surfaces["observed"], force_scale=1.0, conditions=conditions)
-    truth = model.solve(0.0, None, conditions.inputs(np.full(conditions.count, 0.1))).displacement
+    parameter_blocks = ParameterBlocks(body, {"young_modulus": np.full(len(body.cells), MODULUS)}, unknowns)
+    registrar = prepare(model, None, body.surfaces["observed"], force_scale=1.0, parameter_blocks=parameter_blocks)
+    truth = model.solve(0.0, None, parameter_blocks.inputs(np.full(parameter_blocks.count, 0.1))).displacement
     return registrar.register(cloud_on(body, truth, 600, rng, 5e-4))
 
 
 def test_a_collinear_pair_is_named_and_neither_of_them_alone(body: Body, rng: np.random.Generator) -> None:
     near, far = halves(body)
-    found = registered(body, (0.5, 0.5), (Stiffness(0.5, near, "root"), Stiffness(0.5, far, "tumour")), rng)
+    found = registered(body, (0.5, 0.5), (YoungModulus(0.5, near, "root"), YoungModulus(0.5, far, "tumour")), rng)
     assert found.judgement.verdict is Verdict.DOUBTFUL
     (reason,) = found.judgement.reasons
     assert "does not tell Young's modulus of" in reason and " against Young's modulus of " in reason
     assert "root" in reason and "tumour" in reason
-    part = found.problem.condition_part
+    part = found.problem.parameter_part
     values = np.linalg.eigvalsh(found.posterior.covariance[part, part])
     assert values[0] < 0.01 and values[1] > 0.99  # the sum is told, the difference is not
 
@@ -94,7 +94,7 @@ def test_a_collinear_pair_is_named_and_neither_of_them_alone(body: Body, rng: np
 def test_a_tumour_against_the_rest(body: Body, rng: np.random.Generator) -> None:
     """The whole body's modulus is that of the rest where a region has its own: their names say so."""
     _, far = halves(body)
-    found = registered(body, (0.5, 0.5), (Stiffness(0.5), Stiffness(1.0, far, "tumour")), rng)
+    found = registered(body, (0.5, 0.5), (YoungModulus(0.5), YoungModulus(1.0, far, "tumour")), rng)
     (reason,) = found.judgement.reasons
     said = "the cloud does not tell Young's modulus of the rest against Young's modulus of tumour under this load: "
     assert reason.startswith(said)
@@ -102,24 +102,31 @@ def test_a_tumour_against_the_rest(body: Body, rng: np.random.Generator) -> None
 
 def test_one_that_is_not_seen_at_all_is_named_alone(body: Body, rng: np.random.Generator) -> None:
     near, far = halves(body)
-    found = registered(body, (1.0, 0.0), (Stiffness(0.5, near, "root"), Stiffness(0.5, far, "tumour")), rng)
+    found = registered(body, (1.0, 0.0), (YoungModulus(0.5, near, "root"), YoungModulus(0.5, far, "tumour")), rng)
     (reason,) = found.judgement.reasons
     assert reason.startswith("the cloud does not tell Young's modulus of tumour under this load: what is given")
 
 
 def test_a_pair_that_is_told_is_accepted(body: Body) -> None:
-    conditions = Conditions(body, {"young_modulus": MODULUS, "poisson_ratio": 0.4}, (Stiffness(), PoissonRatio()))
+    parameter_blocks = ParameterBlocks(
+        body, {"young_modulus": MODULUS, "poisson_ratio": 0.4}, (YoungModulus(), PoissonRatio())
+    )
     names = ["E", "nu"]
-    assert untold(conditions, names, np.diag([0.1, 0.3]), 0.5) == ([], [])
-    assert untold(conditions, names, np.full((2, 2), np.nan), 0.5) == ([], [])
-    assert untold(conditions, names, np.eye(2), 0.5) == (names, [])  # of what is told not at all, no combination
+    assert uninformed(parameter_blocks, names, np.diag([0.1, 0.3]), 0.5) == ([], [])
+    assert uninformed(parameter_blocks, names, np.full((2, 2), np.nan), 0.5) == ([], [])
+    assert uninformed(parameter_blocks, names, np.eye(2), 0.5) == (
+        names,
+        [],
+    )  # of what is told not at all, no combination
 
 
 @pytest.mark.parametrize(
     ("direction", "words"), [((1.0, -1.0), "E against nu"), ((1.0, 2.0), "nu with E"), ((-2.0, 1.0), "E against nu")]
 )
 def test_a_direction_is_said_by_its_larger_share(body: Body, direction: tuple[float, float], words: str) -> None:
-    conditions = Conditions(body, {"young_modulus": MODULUS, "poisson_ratio": 0.4}, (Stiffness(), PoissonRatio()))
+    parameter_blocks = ParameterBlocks(
+        body, {"young_modulus": MODULUS, "poisson_ratio": 0.4}, (YoungModulus(), PoissonRatio())
+    )
     along = np.array(direction) / np.linalg.norm(direction)
     covariance = 0.01 * np.eye(2) + 0.98 * np.outer(along, along)
-    assert untold(conditions, ["E", "nu"], covariance, 0.5) == ([], [words])
+    assert uninformed(parameter_blocks, ["E", "nu"], covariance, 0.5) == ([], [words])

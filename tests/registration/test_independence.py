@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body
-from softtwin.registration.independence import inflation
 from softtwin.registration.options import expected_force
 from softtwin.registration.registrar import prepare
+from softtwin.registration.residual_correlation import variance_inflation
 
 from .conftest import cloud_on
 
@@ -27,7 +27,7 @@ def on_a_square(count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def test_independent_points_tell_what_they_are_many(rng: np.random.Generator) -> None:
-    found = [inflation(on_a_square(800, rng), rng.standard_normal(800), np.ones(800)) for _ in range(20)]
+    found = [variance_inflation(on_a_square(800, rng), rng.standard_normal(800), np.ones(800)) for _ in range(20)]
     assert np.median(found) < 1.15
     assert max(found) < 1.6
 
@@ -40,7 +40,7 @@ def test_the_variance_of_a_mean_is_that_of_so_many_fewer(rng: np.random.Generato
         places = on_a_square(800, rng)
         values = shared_noise(places, length, rng)[:, 0]
         means.append(values.mean())
-        found.append(inflation(places, values, np.ones(800)))
+        found.append(variance_inflation(places, values, np.ones(800)))
     assert np.median(found) == pytest.approx(800.0 * np.mean(np.square(means)), rel=0.45)
     assert np.median(found) > 5.0
 
@@ -48,11 +48,11 @@ def test_the_variance_of_a_mean_is_that_of_so_many_fewer(rng: np.random.Generato
 def test_small_residuals_and_few_points_are_left_alone(rng: np.random.Generator) -> None:
     places = on_a_square(400, rng)
     smooth = shared_noise(places, 0.2, rng)[:, 0]
-    assert inflation(places, 0.05 * smooth, np.ones(400)) == 1.0  # far below what the deviations allow for
-    assert inflation(places, np.zeros(400), np.ones(400)) == 1.0
-    assert inflation(places[:10], smooth[:10], np.ones(10)) == 1.0
-    assert inflation(np.zeros((400, 3)), smooth, np.ones(400)) == 1.0
-    assert inflation(places, 5.0 * smooth, np.zeros(400)) == 1.0
+    assert variance_inflation(places, 0.05 * smooth, np.ones(400)) == 1.0  # far below what the deviations allow for
+    assert variance_inflation(places, np.zeros(400), np.ones(400)) == 1.0
+    assert variance_inflation(places[:10], smooth[:10], np.ones(10)) == 1.0
+    assert variance_inflation(np.zeros((400, 3)), smooth, np.ones(400)) == 1.0
+    assert variance_inflation(places, 5.0 * smooth, np.zeros(400)) == 1.0
 
 
 @pytest.mark.fenicsx
@@ -80,7 +80,7 @@ def test_shared_noise_is_no_force(body: Body, rng: np.random.Generator) -> None:
                 assert found.judgement.is_usable
                 missed = found.net_force - net
                 each.append(missed @ np.linalg.solve(found.net_force_covariance, missed) / 3.0)
-                alike[length].append(found.alike)
+                alike[length].append(found.inflation_factor)
     assert np.median(alike[0.0]) < 1.3
     assert np.median(alike[0.05]) > 5.0
     assert np.sqrt(np.mean(scores[0.0])) < 1.4

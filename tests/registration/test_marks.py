@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import GaussNewton
+from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.landmarks import LandmarkPairs
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.loss import Square
-from softtwin.registration.marks import Marks
 from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.pose import Pose
+from softtwin.registration.priors import ModelError, PosePrior, nodal_forces
 from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import ModelError, PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -29,18 +29,18 @@ NET = (0.3, 0.3, -0.8)
 DEVIATION = 1e-3
 
 
-def marks_on(body: Body, observed: SurfaceDistance, count: int, deviation: float = DEVIATION) -> Marks:
+def marks_on(body: Body, observed: SurfaceDistance, count: int, deviation: float = DEVIATION) -> LandmarkPairs:
     """Some nodes of the surface, found where they are."""
     u = Cantilever(body).solve(tip_forces(body, NET)).displacement
     nodes = np.random.default_rng(3).choice(observed.nodes, count, replace=False)
-    return Marks.of(observed, body.points[nodes], body.points[nodes] + u[nodes], deviation)
+    return LandmarkPairs.of(observed, body.points[nodes], body.points[nodes] + u[nodes], deviation)
 
 
 @pytest.fixture
 def problem(body: Body) -> Problem:
     """With all kinds of unknowns that the test model has: forces, pose, errors."""
     model, observed = Cantilever(body), SurfaceDistance(body, body.surfaces["observed"])
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 0.5, least=1e-4), smoothness=0.1)
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4), smoothness=0.1)
     turned = Pose.identity().moved(np.array([0.1, -0.05, 0.02, 0.01, 0.0, -0.02]), np.zeros(3))
     pose = PosePrior(turned, body.points.mean(axis=0), 0.05, 0.01)
     error = replace(ModelError.of(patterns(body), observed.nodes), size=0.1)
@@ -48,33 +48,35 @@ def problem(body: Body) -> Problem:
     marks = marks_on(body, observed, 4)
     marks = replace(marks, places=pose.mean.apply(marks.places))
     reduced = reduce_model(model, observed.nodes, forces.basis)
-    return Problem(reduced, observed, forces, pose, cloud, Scale(1e-3, 1.0), error, marks=marks)
+    return Problem(reduced, observed, forces, pose, cloud, LogNormalPrior(1e-3, 1.0), error, landmarks=marks)
 
 
 def test_the_derivative_is_that_of_the_residuals(problem: Problem, rng: np.random.Generator) -> None:
     at = 0.1 * rng.standard_normal(problem.size)
-    trial = problem.trial(at)
-    jacobian, step = problem.mark_jacobian(trial), 1e-6
+    evaluation = problem.evaluation(at)
+    jacobian, step = problem.landmark_jacobian(evaluation), 1e-6
     for column in range(problem.size):
         change = np.zeros(problem.size)
         change[column] = step
-        ahead, behind = (problem.mark_residuals(problem.trial(at + sign * change)) for sign in (1.0, -1.0))
+        ahead, behind = (problem.landmark_residuals(problem.evaluation(at + sign * change)) for sign in (1.0, -1.0))
         wanted = (ahead - behind) / (2.0 * step)
         np.testing.assert_allclose(jacobian[:, column], wanted, atol=1e-6 * np.abs(jacobian).max())
     cotangent = rng.standard_normal(len(jacobian))
-    np.testing.assert_allclose(problem.marks_pulled(trial, cotangent), cotangent @ jacobian, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(problem.landmarks_vjp(evaluation, cotangent), cotangent @ jacobian, rtol=1e-9, atol=1e-9)
 
 
 def test_at_the_truth_nothing_is_left(body: Body) -> None:
     observed = SurfaceDistance(body, body.surfaces["observed"])
     u = Cantilever(body).solve(tip_forces(body, NET)).displacement
     marks = marks_on(body, observed, 5)
-    np.testing.assert_allclose(observed.moved_feet(marks.feet, u[observed.nodes]), marks.places, atol=1e-12)
+    np.testing.assert_allclose(
+        observed.moved_closest_points(marks.closest_points, u[observed.nodes]), marks.places, atol=1e-12
+    )
 
 
 def registrar(body: Body, solver: GaussNewton | LBFGS) -> Registrar:
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 0.5, least=1e-4), smoothness=0.2)
-    options = RegistrationOptions(solver=solver, gathering=replace(RegistrationOptions().gathering, rounds=0))
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4), smoothness=0.2)
+    options = RegistrationOptions(solver=solver, localisation=replace(RegistrationOptions().localisation, rounds=0))
     return Registrar(Cantilever(body), SurfaceDistance(body, body.surfaces["observed"]), forces, options)
 
 
@@ -86,7 +88,7 @@ def test_they_tell_what_the_cloud_does_not(body: Body, solver: GaussNewton | LBF
     own = registrar(body, solver)
     few = cloud[cloud[:, 0] < 0.8 * cloud[:, 0].max()]  # the end is not seen
     without = own.register(few)
-    with_marks = own.marked(marks_on(body, own.observed, 6, 2e-4)).register(few)
+    with_marks = own.with_landmarks(marks_on(body, own.observed, 6, 2e-4)).register(few)
     errors = [np.linalg.norm(result.displacement - u, axis=1).mean() for result in (without, with_marks)]
     assert errors[1] < 0.5 * errors[0]
     assert with_marks.uncertainty.deviation.mean() < without.uncertainty.deviation.mean()
@@ -100,7 +102,7 @@ def test_one_that_was_taken_for_another_makes_a_doubtful_frame(body: Body) -> No
     right = marks_on(body, own.observed, 4)
     places = right.places.copy()
     places[2] += 0.03
-    result = own.marked(replace(right, places=places)).register(cloud)
+    result = own.with_landmarks(replace(right, places=places)).register(cloud)
     assert result.judgement.verdict is not Verdict.ACCEPTED
     assert any("landmark 2 lies" in reason for reason in result.judgement.reasons)
 
@@ -110,19 +112,19 @@ def test_none_change_nothing(body: Body) -> None:
         body, Cantilever(body).solve(tip_forces(body, NET)).displacement, 300, np.random.default_rng(2), 5e-4
     )
     own = registrar(body, GaussNewton((Square(),)))
-    plain, marked = own.register(cloud), own.marked(None).register(cloud)
+    plain, marked = own.register(cloud), own.with_landmarks(None).register(cloud)
     np.testing.assert_array_equal(plain.displacement, marked.displacement)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"points": np.zeros((2, 2))}, r"Marks.points: expected shape \(l, 3\)"),
-        ({"points": np.zeros((0, 3)), "places": np.zeros((0, 3))}, r"Marks.points: expected shape \(l, 3\)"),
-        ({"places": np.zeros((3, 3))}, r"Marks.places: expected shape \(l, 3\), as many of both"),
-        ({"places": np.full((2, 3), np.nan)}, "Marks.places: expected finite numbers"),
-        ({"deviation": 0.0}, "Marks.deviation: expected a positive number"),
-        ({"points": np.full((2, 3), 9.0)}, "expected points on the observed side at rest; point 0 lies"),
+        ({"points": np.zeros((2, 2))}, r"LandmarkPairs.points: expected shape \(l, 3\)"),
+        ({"points": np.zeros((0, 3)), "places": np.zeros((0, 3))}, r"LandmarkPairs.points: expected shape \(l, 3\)"),
+        ({"places": np.zeros((3, 3))}, r"LandmarkPairs.places: expected shape \(l, 3\), as many of both"),
+        ({"places": np.full((2, 3), np.nan)}, "LandmarkPairs.places: expected finite numbers"),
+        ({"deviation": 0.0}, "LandmarkPairs.deviation: expected a positive number"),
+        ({"points": np.full((2, 3), 9.0)}, "expected points on the observed surface; point 0 lies"),
     ],
 )
 def test_what_are_no_landmarks_is_refused(body: Body, change: dict[str, object], words: str) -> None:
@@ -130,4 +132,4 @@ def test_what_are_no_landmarks_is_refused(body: Body, change: dict[str, object],
     points = body.points[observed.nodes[:2]]
     given = {"points": points, "places": points, "deviation": 1e-3} | change
     with pytest.raises(ValueError, match=words):
-        Marks.of(observed, **given)  # type: ignore[arg-type]
+        LandmarkPairs.of(observed, **given)  # type: ignore[arg-type]

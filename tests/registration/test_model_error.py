@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body
-from softtwin.registration.evidence import Scale, linearised
 from softtwin.registration.forward import reduce_model
+from softtwin.registration.hyperparameters import LogNormalPrior, linearised
 from softtwin.registration.options import options_for
 from softtwin.registration.pose import Pose
-from softtwin.registration.problem import Problem, Trial
+from softtwin.registration.priors import ModelError, PosePrior, nodal_forces
+from softtwin.registration.problem import Evaluation, Problem
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import ModelError, PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -57,7 +57,7 @@ def true_displacement(body: Body, a: np.ndarray) -> np.ndarray:
 
 def registrar(body: Body, known: bool = True) -> Registrar:
     """Forces across the beam alone: along itself a straight side slides, and what covers a cloud may be any longer."""
-    every = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 0.5, least=1e-4))
+    every = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4))
     across = np.flatnonzero(np.arange(every.size) % 3 > 0)
     forces = every.combined(np.eye(every.size)[:, across])
     return Registrar(Biased(body, known), SurfaceDistance(body, body.surfaces["observed"]), forces)
@@ -91,7 +91,7 @@ def test_doubt_of_the_net_force_knows_of_the_models_error(body: Body) -> None:
         exact = Registrar(Cantilever(body), made.observed, made.forces).register(cloud)
         missed = (exact.net_force - NET)[1:]
         blind.append(missed @ np.linalg.solve(exact.net_force_covariance[1:, 1:], missed) / 2.0)
-        shared.append(exact.problem.correlated is not None or exact.alike > 5.0)
+        shared.append(exact.problem.correlated is not None or exact.inflation_factor > 5.0)
     assert 0.5 < np.mean(scores) < 1.5
     assert 1.5 * np.mean(scores) < np.mean(blind) < 4.0 * np.mean(scores)
     assert np.mean(shared) > 0.9
@@ -101,7 +101,7 @@ def test_doubt_of_the_net_force_knows_of_the_models_error(body: Body) -> None:
 def test_more_than_the_model_was_seen_to_get_wrong_is_doubtful(body: Body, rng, size: float, verdict: Verdict) -> None:
     cloud = cloud_on(body, true_displacement(body, np.array([size, -size])), 400, rng, 5e-4)
     result = registrar(body).register(cloud)
-    assert result.judgement.verdict is verdict, (result.doubt, result.judgement.reasons)
+    assert result.judgement.verdict is verdict, (result.discrepancy_scale, result.judgement.reasons)
     assert any("seen to get wrong" in each for each in result.judgement.reasons) == (verdict is Verdict.DOUBTFUL)
 
 
@@ -143,27 +143,29 @@ def test_the_next_frame_starts_from_the_error_found(body: Body, rng) -> None:
 def test_the_derivative_of_the_distances_is_exact(body: Body, rng) -> None:
     """By central differences, with forces, pose and model error at once; the adjoint gives the same."""
     model, observed = Biased(body), SurfaceDistance(body, body.surfaces["observed"])
-    forces = nodal_forces(body, body.node_sets["tip"][:4], Scale(0.05, 0.5))
+    forces = nodal_forces(body, body.node_sets["tip"][:4], LogNormalPrior(0.05, 0.5))
     prior = PosePrior(Pose.identity(), body.points.mean(axis=0))
     error = replace(ModelError.of(model.discrepancy, observed.nodes), size=0.1)
     cloud = cloud_on(body, true_displacement(body, np.array([1.0, -1.0])), 100, rng, 5e-3)
     reduced = reduce_model(model, observed.nodes, forces.basis)
-    problem = Problem(reduced, observed, forces, prior, cloud, Scale(1e-3, 1.0), error)
+    problem = Problem(reduced, observed, forces, prior, cloud, LogNormalPrior(1e-3, 1.0), error)
     at = 0.1 * rng.standard_normal(problem.size)
-    trial, direction, step = problem.trial(at), rng.standard_normal(problem.size), 1e-6
+    evaluation, direction, step = problem.evaluation(at), rng.standard_normal(problem.size), 1e-6
     assert problem.size == forces.size + 6 + 2
 
-    def near(sign: float) -> Trial:
-        return problem.trial(at + sign * step * direction, trial)
+    def near(sign: float) -> Evaluation:
+        return problem.evaluation(at + sign * step * direction, evaluation)
 
     ahead, behind = near(1.0), near(-1.0)
-    stays = (ahead.match.triangles == trial.match.triangles) & (behind.match.triangles == trial.match.triangles)
-    jacobian = problem.jacobian(trial)
+    stays = (ahead.match.triangles == evaluation.match.triangles) & (
+        behind.match.triangles == evaluation.match.triangles
+    )
+    jacobian = problem.jacobian(evaluation)
     differences = (ahead.match.distances - behind.match.distances) / (2.0 * step)
     assert stays.mean() > 0.9
     np.testing.assert_allclose((jacobian @ direction)[stays], differences[stays], rtol=1e-4, atol=1e-7)
     cotangent = rng.standard_normal(len(cloud))
-    np.testing.assert_allclose(problem.pulled(trial, cotangent), jacobian.T @ cotangent, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(problem.vjp(evaluation, cotangent), jacobian.T @ cotangent, rtol=1e-8, atol=1e-10)
 
 
 def test_unknowns_beside_are_integrated_out(rng) -> None:

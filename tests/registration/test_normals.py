@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.registration.cloud import Cloud, turned
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import GaussNewton
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.pose import Pose
+from softtwin.registration.priors import ModelError, PosePrior, nodal_forces
 from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import ModelError, PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -46,7 +46,7 @@ def oriented(body: Body, u: Floats, count: int, seed: int, noise: float = NOISE)
 def problem(body: Body, rng: np.random.Generator) -> Problem:
     """With forces, a pose far from none, and errors as unknowns."""
     model, observed = Cantilever(body), SurfaceDistance(body, body.surfaces["observed"])
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 0.5, least=1e-4), smoothness=0.1)
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4), smoothness=0.1)
     mean = Pose.identity().moved(np.array([0.1, -0.05, 0.02, 0.01, 0.0, -0.02]), np.zeros(3))
     pose = PosePrior(mean, body.points.mean(axis=0), 0.05, 0.01)
     error = replace(ModelError.of(patterns(body), observed.nodes), size=0.1)
@@ -58,27 +58,27 @@ def problem(body: Body, rng: np.random.Generator) -> Problem:
         observed=observed,
         forces=forces,
         pose=pose,
-        noise=Scale(1e-3, 1.0),
+        noise=LogNormalPrior(1e-3, 1.0),
         error=error,
     )
 
 
 def test_the_derivative_is_that_of_the_residuals(problem: Problem, rng: np.random.Generator) -> None:
     at = 0.1 * rng.standard_normal(problem.size)
-    trial = problem.trial(at)
-    jacobian = problem.normal_jacobian(trial)
+    evaluation = problem.evaluation(at)
+    jacobian = problem.normal_jacobian(evaluation)
     assert jacobian.shape == (160, problem.size)
     assert not jacobian[6:8].any()  # of the point without a normal
     direction = rng.standard_normal(problem.size)
 
     def residuals(step: float) -> Floats:  # a point that goes on to the next triangle has another normal: held here
-        return problem.normal_residuals(problem.trial(at + step * direction, trial), trial.match)
+        return problem.normal_residuals(problem.evaluation(at + step * direction, evaluation), evaluation.match)
 
     steps = 1e-2 * 0.5 ** np.arange(5)
     errors = [np.linalg.norm(residuals(h) - residuals(0.0) - h * jacobian @ direction) for h in steps]
     assert np.log2(np.divide(errors[:-1], errors[1:])).min() > 1.9
     cotangent = rng.standard_normal(len(jacobian))
-    np.testing.assert_allclose(problem.normals_pulled(trial, cotangent), cotangent @ jacobian, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(problem.normals_vjp(evaluation, cotangent), cotangent @ jacobian, rtol=1e-9, atol=1e-9)
 
 
 def test_planes_have_exact_derivatives(body: Body, rng: np.random.Generator) -> None:
@@ -99,9 +99,9 @@ def test_planes_have_exact_derivatives(body: Body, rng: np.random.Generator) -> 
 
 
 def registrar(body: Body, **options: object) -> Registrar:
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 0.5, least=1e-4), smoothness=0.2)
-    gathering = replace(RegistrationOptions().gathering, rounds=0)
-    chosen = RegistrationOptions(gathering=gathering, normal_deviation=LEANING, **options)  # type: ignore[arg-type]
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4), smoothness=0.2)
+    localisation = replace(RegistrationOptions().localisation, rounds=0)
+    chosen = RegistrationOptions(localisation=localisation, normal_deviation=LEANING, **options)  # type: ignore[arg-type]
     return Registrar(
         Cantilever(body), SurfaceDistance(body, body.surfaces["observed"], chosen.distance), forces, chosen
     )
@@ -153,7 +153,7 @@ def test_a_large_cloud_is_thinned_with_its_normals(body: Body) -> None:
     few = Cloud.of(seen).thinned(50).array()
     assert few.shape == (50, 6)
     assert all((row == seen).all(axis=1).any() for row in few)
-    assert Cloud.of(seen[:, :3]).across is None
+    assert Cloud.of(seen[:, :3]).tangent_basis is None
     np.testing.assert_array_equal(Cloud.of(np.repeat(few, 3, axis=0)).distinct().array(), few)
 
 

@@ -10,12 +10,12 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 from pcn import Law, compared, effective, walked
 
 from softtwin.meshes.body import Body
-from softtwin.registration.evidence import Scale
 from softtwin.registration.gauss_newton import GaussNewton
-from softtwin.registration.options import Gathering, RegistrationOptions
+from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.options import RegistrationOptions, SparseLocalisation
+from softtwin.registration.priors import nodal_forces
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import nodal_forces
 
 from .conftest import Cantilever, cloud_on, tip_forces
 
@@ -24,10 +24,10 @@ pytestmark = pytest.mark.fenicsx
 
 @pytest.fixture
 def law(body: Body, rng: np.random.Generator) -> Law:
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 0.5), 0.2)
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5), 0.2)
     observed, options = (
         SurfaceDistance(body, body.surfaces["observed"]),
-        RegistrationOptions(gathering=Gathering(rounds=0), solver=GaussNewton(settled=5e-3)),
+        RegistrationOptions(localisation=SparseLocalisation(rounds=0), solver=GaussNewton(settled=5e-3)),
     )
     made = Registrar(Cantilever(body), observed, forces, options)
     truth = made.model.solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement

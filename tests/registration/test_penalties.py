@@ -10,21 +10,21 @@ from scipy.optimize import check_grad
 
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.shapes import beam
-from softtwin.registration.evidence import Scale
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.penalties import Amplitude, Divergence, Penalty
+from softtwin.registration.priors import NodalForces, nodal_forces
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import Forces, nodal_forces
 
 from .conftest import Cantilever, cloud_on, tip_forces
 
-SCALE = Scale(0.05, 2.0, least=1e-4)
+SCALE = LogNormalPrior(0.05, 2.0, minimum=1e-4)
 
 
-def everywhere(body: Body, smoothness: float = 0.0) -> Forces:
+def everywhere(body: Body, smoothness: float = 0.0) -> NodalForces:
     return nodal_forces(body, np.arange(len(body.points)), SCALE, smoothness)
 
 
@@ -87,7 +87,9 @@ def test_more_of_it_means_smaller_forces(body: Body, rng) -> None:
     forces, cloud = nodal_forces(body, body.node_sets["tip"], SCALE), cloud_on(body, truth, 300, rng, 1e-4)
     sizes = []
     for alpha in (0.0, 1.0):
-        options = RegistrationOptions(solver=LBFGS(penalty=Amplitude(alpha)), noise=Scale(0.02, 0.0, least=0.02))
+        options = RegistrationOptions(
+            solver=LBFGS(penalty=Amplitude(alpha)), noise=LogNormalPrior(0.02, 0.0, minimum=0.02)
+        )
         found = Registrar(Cantilever(body), observed, forces, options).register(cloud)
         sizes.append(np.linalg.norm(found.forces, axis=1).sum())
     assert sizes[1] < 0.98 * sizes[0]

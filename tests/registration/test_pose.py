@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from softtwin.meshes.files import FileError
 from softtwin.registration.pose import Pose, PoseError, from_landmarks, read_landmarks, read_matrix
-from softtwin.registration.unknowns import PosePrior
+from softtwin.registration.priors import PosePrior
 
 
 def _pose(rng: np.random.Generator) -> Pose:
@@ -86,7 +86,16 @@ def test_a_matrix_typed_with_four_digits_becomes_a_rotation(rng: np.random.Gener
     assert pose.angle_to(typed) < 2e-4
 
 
-@pytest.mark.parametrize("wide", [{"turn": 0.0}, {"shift": 0.0}, {"shift": -1.0}, {"turn": np.nan}, {"turn": np.inf}])
+@pytest.mark.parametrize(
+    "wide",
+    [
+        {"rotation_deviation": 0.0},
+        {"translation_deviation": 0.0},
+        {"translation_deviation": -1.0},
+        {"rotation_deviation": np.nan},
+        {"rotation_deviation": np.inf},
+    ],
+)
 def test_a_prior_of_no_width_is_refused(wide: dict[str, float]) -> None:
     (name,) = wide
     with pytest.raises(ValueError, match=rf"PosePrior\.{name}: expected a positive deviation, got"):

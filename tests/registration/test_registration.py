@@ -10,17 +10,17 @@ import pytest
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.reference.data.outcome import NotConverged
-from softtwin.registration.evidence import Scale
 from softtwin.registration.gauss_newton import GaussNewton
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.loss import Square
 from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
+from softtwin.registration.priors import NodalForces, PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar, register_sequence
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.result import Registration
-from softtwin.registration.unknowns import Forces, PosePrior, nodal_forces
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -28,8 +28,8 @@ from .conftest import Cantilever, cloud_on, tip_forces
 NET = (0.0, 0.3, -0.8)
 
 
-def forces_of(body: Body, scale: Scale | None = None) -> Forces:
-    return nodal_forces(body, body.node_sets["tip"], scale or Scale(0.05, 2.0, least=1e-4))
+def forces_of(body: Body, scale: LogNormalPrior | None = None) -> NodalForces:
+    return nodal_forces(body, body.node_sets["tip"], scale or LogNormalPrior(0.05, 2.0, minimum=1e-4))
 
 
 def registrar(body: Body, solver: GaussNewton | LBFGS | None = None, **more: object) -> Registrar:
@@ -102,7 +102,7 @@ def test_a_step_that_is_cut_is_no_convergence(body: Body, rng) -> None:
     truth = Cantilever(body).solve(tip_forces(body, NET)).displacement
     cloud = cloud_on(body, truth, 200, rng)
     cut = register(body, cloud, GaussNewton(max_iterations=2, max_step=1e-3))
-    assert cut.outcome is Outcome.MOST_ITERATIONS
+    assert cut.outcome is Outcome.MAXIMUM_ITERATIONS
     assert not cut.outcome.is_success and "max_iterations" in cut.outcome.advice
     assert any("not converged" in reason for reason in cut.judgement.reasons)
 
@@ -198,7 +198,7 @@ def test_large_clouds_are_thinned_and_answer_alike(body: Body, rng) -> None:
     missed = []
     for _ in range(15):
         large = made.register(cloud_on(body, truth, 50_000, rng, 1e-3))
-        assert 500 < large.points <= made.options.most_points
+        assert 500 < large.points <= made.options.maximum_points
         assert large.noise == pytest.approx(1e-3, rel=0.15)
         missed.append(np.abs(large.displacement - truth)[:, 1:].max())  # along the beam hardly anything is seen
     assert np.median(missed) < 5e-4  # of many: one cloud proves nothing
@@ -214,13 +214,13 @@ def test_points_that_are_there_again_tell_nothing_more(body: Body, rng) -> None:
     np.testing.assert_array_equal(often.net_force_covariance, once.net_force_covariance)
 
 
-@pytest.mark.parametrize("name", ["settled", "enough", "handed_on", "max_step", "least_step"])
+@pytest.mark.parametrize("name", ["settled", "enough", "handed_on", "max_step", "minimum_step"])
 def test_options_that_cannot_be_are_named(name: str) -> None:
     with pytest.raises(ValueError, match=rf"GaussNewton\.{name}: expected a positive number"):
         GaussNewton(**{name: 0.0})
     with pytest.raises(ValueError, match=r"GaussNewton\.max_iterations: expected at least 1"):
         GaussNewton(max_iterations=0)
-    with pytest.raises(ValueError, match="most_points"):
-        RegistrationOptions(most_points=0)
+    with pytest.raises(ValueError, match="maximum_points"):
+        RegistrationOptions(maximum_points=0)
     with pytest.raises(ValueError, match="LBFGS"):
         LBFGS(memory=0)

@@ -13,16 +13,16 @@ from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import outer_nodes
 from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import LocalModel
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.loss import Huber
 from softtwin.registration.pose import Pose
+from softtwin.registration.priors import PosePrior, nodal_forces
 from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.thinning import thinned
-from softtwin.registration.unknowns import PosePrior, nodal_forces
 
 from .conftest import Cantilever, cloud_on, tip_forces
 
@@ -45,7 +45,7 @@ def test_a_surface_that_cells_carry_is_where_it_was(body: Body, carried: Body, o
     same = skin.match(np.zeros((len(skin.nodes), 3)), cloud)
     assert np.allclose(same.distances, rest.distances, atol=1e-12)
     height = carried.points[skin.nodes, 2]
-    assert np.allclose(skin.at_points(same, height), skin.feet(same)[:, 2], atol=1e-12)
+    assert np.allclose(skin.at_points(same, height), skin.closest_points(same)[:, 2], atol=1e-12)
 
 
 def test_forces_on_a_grid_are_found_from_a_cloud_of_its_skin(carried: Body, rng) -> None:
@@ -77,21 +77,21 @@ def test_rows_are_the_derivative_of_the_distances(on_a_grid: bool, body: Body, c
 
 def test_all_coefficients_pass_the_taylor_test(body: Body, observed: SurfaceDistance, rng) -> None:
     """Forces and pose together, at a state and a pose that are far from rest."""
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 1.0))
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 1.0))
     prior = PosePrior(Pose.identity(), body.points.mean(axis=0))
     model = reduce_model(Cantilever(body), observed.nodes, forces.basis)
     cloud = cloud_on(body, np.zeros_like(body.points), 80, rng, noise=5e-3)
-    problem = Problem(model, observed, forces, prior, cloud, Scale(1e-3, 1.0))
+    problem = Problem(model, observed, forces, prior, cloud, LogNormalPrior(1e-3, 1.0))
     here = np.concatenate([0.02 * rng.standard_normal(forces.size), rng.standard_normal(6)])
     along = np.concatenate([0.02 * rng.standard_normal(forces.size), rng.standard_normal(6)])
-    start = problem.trial(here)
+    start = problem.evaluation(here)
     slope = problem.jacobian(start) @ along
     steps = 0.02 * 0.5 ** np.arange(4)
-    moved = [problem.trial(here + h * along, start).match.distances for h in steps]
+    moved = [problem.evaluation(here + h * along, start).match.distances for h in steps]
     errors = [np.median(np.abs(m - start.match.distances - h * slope)) for m, h in zip(moved, steps, strict=True)]
     assert np.median(np.log2(np.divide(errors[:-1], errors[1:]))) > 1.9
     cotangent = rng.standard_normal(len(cloud))
-    np.testing.assert_allclose(problem.pulled(start, cotangent), cotangent @ problem.jacobian(start), rtol=1e-9)
+    np.testing.assert_allclose(problem.vjp(start, cotangent), cotangent @ problem.jacobian(start), rtol=1e-9)
 
 
 def _ball(radius: float = 0.05) -> Body:
@@ -128,12 +128,12 @@ def test_a_tip_is_expected_no_further_off_than_a_point(rng) -> None:
 
 def test_what_is_yet_to_be_explained_is_no_noise_of_the_points(body: Body, observed: SurfaceDistance, rng) -> None:
     """At rest a moved surface looks like noise; as much of it would put every round place where it is not."""
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 1.0))
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 1.0))
     cantilever = Cantilever(body)
     model = reduce_model(cantilever, observed.nodes, forces.basis)
     cloud = cloud_on(body, cantilever.solve(tip_forces(body, (0.0, 0.4, 0.8))).displacement, 200, rng, noise=1e-3)
-    problem = Problem(model, observed, forces, None, cloud, Scale(1e-3, 1.5))
-    rest = problem.trial(np.zeros(forces.size))
+    problem = Problem(model, observed, forces, None, cloud, LogNormalPrior(1e-3, 1.5))
+    rest = problem.evaluation(np.zeros(forces.size))
     local = LocalModel(problem, rest, Huber(), rest.match.rms, graduation=1.0)
     assert local.is_graduated and local.own < 0.5 * local.noise
 
@@ -244,5 +244,5 @@ def test_thinning_keeps_points_and_spreads_them(rng) -> None:
     assert 600 < len(kept) <= 1000 and len(np.unique(kept)) == len(kept)
     assert (cloud[kept].max(axis=1) < 0.011).mean() < 0.05  # half of the points lie in that corner
     assert np.array_equal(thinned(cloud[:50], 100), np.arange(50))
-    with pytest.raises(ValueError, match=r"thinned\.most: expected at least 1"):
+    with pytest.raises(ValueError, match=r"thinned\.maximum: expected at least 1"):
         thinned(cloud, 0)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body
-from softtwin.registration.evidence import Scale, Scales, find_scales, linearised
+from softtwin.registration.hyperparameters import Hyperparameters, LogNormalPrior, estimate_hyperparameters, linearised
 from softtwin.registration.loss import Huber, Loss, Square, Tukey, robust_deviation
 from softtwin.registration.posterior import Posterior, posterior
 from softtwin.registration.prepared import Prepared
+from softtwin.registration.priors import LikelihoodInformed, NodalForces, contact, localised, nodal_forces
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import Forces, Informed, contact, nodal_forces, windowed
 
 from .conftest import Cantilever
 
@@ -40,8 +40,8 @@ def test_losses_that_cannot_be_are_named() -> None:
         Huber(0.0)
     with pytest.raises(ValueError, match=r"Tukey\.c: expected a positive number"):
         Tukey(float("nan"))
-    with pytest.raises(ValueError, match=r"Scale: expected a positive median"):
-        Scale(-1.0, 1.0)
+    with pytest.raises(ValueError, match=r"LogNormalPrior: expected a positive median"):
+        LogNormalPrior(-1.0, 1.0)
 
 
 def test_the_robust_deviation_forgets_outliers(rng) -> None:
@@ -57,36 +57,43 @@ def test_scales_are_found_from_linear_data(rng, noise: float, force: float) -> N
     coefficients = force * rng.standard_normal(30)
     data = jacobian @ coefficients + noise * rng.standard_normal(400)
     local = linearised(jacobian, -data, np.ones(400), np.zeros(30), 1.0)
-    found = find_scales(local, Scale(1e-3, 2.0), Scale(0.05, 2.5))
+    found = estimate_hyperparameters(local, LogNormalPrior(1e-3, 2.0), LogNormalPrior(0.05, 2.5))
     assert found.noise == pytest.approx(noise, rel=0.15)
     assert found.force == pytest.approx(force, rel=0.45)
     # About another state the linear problem is the same one.
     away = rng.standard_normal(30)
     again = linearised(jacobian, jacobian @ away - data, np.ones(400), away, 1.0)
-    assert find_scales(again, Scale(1e-3, 2.0), Scale(0.05, 2.5)).noise == pytest.approx(found.noise, rel=1e-6)
+    assert estimate_hyperparameters(again, LogNormalPrior(1e-3, 2.0), LogNormalPrior(0.05, 2.5)).noise == pytest.approx(
+        found.noise, rel=1e-6
+    )
 
 
 def test_a_scale_that_is_known_stays(rng) -> None:
     jacobian = rng.standard_normal((100, 5))
     local = linearised(jacobian, rng.standard_normal(100), np.ones(100), np.zeros(5), 1.0)
-    assert find_scales(local, Scale(1e-2, 0.0), Scale(0.05, 1.0)).noise == pytest.approx(1e-2, rel=0.06)
-    assert find_scales(local, Scale(1e-2, 1.0, least=5.0), Scale(0.05, 1.0)).noise >= 5.0 * 0.95
+    assert estimate_hyperparameters(local, LogNormalPrior(1e-2, 0.0), LogNormalPrior(0.05, 1.0)).noise == pytest.approx(
+        1e-2, rel=0.06
+    )
+    assert (
+        estimate_hyperparameters(local, LogNormalPrior(1e-2, 1.0, minimum=5.0), LogNormalPrior(0.05, 1.0)).noise
+        >= 5.0 * 0.95
+    )
 
 
-def told_forces(forces: Forces, observed: SurfaceDistance, rule: Informed) -> Forces:
+def told_forces(forces: NodalForces, observed: SurfaceDistance, rule: LikelihoodInformed) -> NodalForces:
     return Prepared.of(Cantilever(observed.body), observed, forces).informed(observed, rule).forces
 
 
 def test_what_is_left_out_keeps_its_variance(body: Body) -> None:
-    every = nodal_forces(body, body.node_sets["tip"], Scale(0.1, 1.0))
+    every = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.1, 1.0))
     observed = SurfaceDistance(body, body.surfaces["observed"])
-    few = told_forces(every, observed, Informed(most=2))
+    few = told_forces(every, observed, LikelihoodInformed(maximum=2))
     assert few.size == 2 and few.every is every.patterns
     prior = every.net_basis @ every.net_basis.T
     np.testing.assert_allclose(few.net_basis @ few.net_basis.T + few.left_out, prior, atol=1e-9 * prior.max())
     np.testing.assert_allclose(few.basis.T @ few.basis, np.eye(2), atol=1e-12)
     # This model moves by three sums of the forces alone: with three directions nothing that moves is left out.
-    three = told_forces(every, observed, Informed(most=50))
+    three = told_forces(every, observed, LikelihoodInformed(maximum=50))
     assert three.size == 3
 
 
@@ -103,7 +110,7 @@ def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(rng) -> None:
     def found(scale: float) -> Posterior:
         precision = np.array([scale**-2, scale**-2, 1.0])
         inverse = np.linalg.inv(jacobian.T @ jacobian + np.diag(precision))
-        scales = Scales(1.0, scale, (0.0, spread))
+        scales = Hyperparameters(1.0, scale, (0.0, spread))
         return posterior(jacobian.T @ jacobian, precision, inverse @ (jacobian.T @ data), scales, 2)
 
     here, step = found(0.3), 1e-4
@@ -114,11 +121,11 @@ def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(rng) -> None:
 
 def _scales():
     local = linearised(np.eye(3), np.ones(3), np.ones(3), np.zeros(3), 1.0)
-    return find_scales(local, Scale(1.0, 0.0), Scale(0.5, 0.0))
+    return estimate_hyperparameters(local, LogNormalPrior(1.0, 0.0), LogNormalPrior(0.5, 0.0))
 
 
 def test_smooth_forces_correlate_and_keep_their_scale(body: Body) -> None:
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.3, 1.0), smoothness=0.1)
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.3, 1.0), smoothness=0.1)
     covariance = (forces.basis @ forces.basis.T).reshape(len(body.points), 3, len(body.points), 3)
     first, second = forces.nodes[:2]
     assert covariance[first, 0, first, 0] == pytest.approx(1.0, rel=2e-3)
@@ -134,11 +141,11 @@ def test_zones_inside_or_fixed_are_refused(body: Body) -> None:
 
 
 def test_contact_is_where_the_forces_are(body: Body) -> None:
-    forces = nodal_forces(body, body.boundary_nodes, Scale(0.1, 1.0))
+    forces = nodal_forces(body, body.boundary_nodes, LogNormalPrior(0.1, 1.0))
     nodal = np.zeros_like(body.points)
     pulled = forces.nodes[np.argmax(body.points[forces.nodes] @ [1.0, 0.0, 1.0])]
     nodal[pulled] = [0.0, 0.0, 2.0]
-    where = contact(forces, nodal, body.points, reach=0.1, least=0.03)
+    where = contact(forces, nodal, body.points, reach=0.1, minimum=0.03)
     distance = np.linalg.norm(body.points - body.points[pulled], axis=1)
     free = np.setdiff1d(forces.nodes, [pulled])
     assert where[pulled] == 1.0
@@ -147,11 +154,11 @@ def test_contact_is_where_the_forces_are(body: Body) -> None:
 
 
 def test_windowed_forces_keep_the_variance_of_what_is_left_out(body: Body) -> None:
-    every = nodal_forces(body, body.node_sets["tip"], Scale(0.1, 1.0), smoothness=0.1)
+    every = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.1, 1.0), smoothness=0.1)
     observed = SurfaceDistance(body, body.surfaces["observed"])
-    few = told_forces(every, observed, Informed(most=2))
+    few = told_forces(every, observed, LikelihoodInformed(maximum=2))
     where = np.linspace(0.1, 1.0, len(body.points))
-    inside = windowed(few, where)
+    inside = localised(few, where)
     whole = (np.repeat(where, 3)[:, None] * every.basis).reshape(-1, 3, every.size).sum(axis=0)
     np.testing.assert_allclose(inside.net_basis @ inside.net_basis.T + inside.left_out, whole @ whole.T, atol=1e-9)
     assert inside.size == 2

@@ -10,26 +10,28 @@ from scipy.stats import chi
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import embed
-from softtwin.registration.evidence import Scale
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import GaussNewton
-from softtwin.registration.options import Gathering, RegistrationOptions
+from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.options import RegistrationOptions, SparseLocalisation
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.pose import Pose
+from softtwin.registration.priors import PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.uncertainty import Uncertainty, unseen_response
-from softtwin.registration.unknowns import PosePrior, nodal_forces
 
 from .conftest import Cantilever, cloud_on
 
 NOISE, FORCE = 2e-3, 0.03
 
 
-def registrar(body: Body, pose: PosePrior | None = None, most_points: int = 1000) -> Registrar:
+def registrar(body: Body, pose: PosePrior | None = None, maximum_points: int = 1000) -> Registrar:
     observed = SurfaceDistance(body, body.surfaces["observed"])
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(FORCE, 0.0))
-    options = RegistrationOptions(noise=Scale(NOISE, 0.0), gathering=Gathering(rounds=0), most_points=most_points)
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(FORCE, 0.0))
+    options = RegistrationOptions(
+        noise=LogNormalPrior(NOISE, 0.0), localisation=SparseLocalisation(rounds=0), maximum_points=maximum_points
+    )
     return Registrar(Cantilever(body), observed, forces, options, pose=pose)
 
 
@@ -123,7 +125,7 @@ def test_a_dense_cloud_promises_no_more_than_its_patches_allow(body: Body) -> No
     """
     length, count = 0.03, 50_000
     patches = round(2 * 0.8 * 0.2 / (2.0 * np.pi * length**2))
-    dense, sparse = registrar(body, most_points=count), registrar(body)
+    dense, sparse = registrar(body, maximum_points=count), registrar(body)
     truth = sparse.model.solve(sparse.forces.forces(np.full(sparse.forces.size, 0.5 * FORCE))).displacement
     doubt: dict[str, list[float]] = {"floor": [], "alike": [], "dense": [], "believed": []}
     for seed in range(20):  # of few points, what is told differs much from cloud to cloud
@@ -134,7 +136,7 @@ def test_a_dense_cloud_promises_no_more_than_its_patches_allow(body: Body) -> No
         cloud = cloud_on(body, truth, count, rng)
         found = dense.register(cloud + NOISE * smooth_field(cloud, length, rng))
         assert found.points == count
-        doubt["alike"].append(found.alike)
+        doubt["alike"].append(found.inflation_factor)
         doubt["dense"].append(float(found.uncertainty.deviation.mean()))
         believed = dense.register(cloud + NOISE * rng.standard_normal(cloud.shape))
         doubt["believed"].append(float(believed.uncertainty.deviation.mean()))
@@ -164,29 +166,29 @@ def test_an_unknown_pose_adds_to_it(body: Body, rng: np.random.Generator) -> Non
 def test_directions_that_were_left_out_are_doubted_still(body: Body, rng: np.random.Generator) -> None:
     """Half of the directions are left out: with what they would do, the covariance at rest is that of all."""
     model, observed = Cantilever(body), SurfaceDistance(body, body.surfaces["observed"])
-    every = nodal_forces(body, body.node_sets["tip"], Scale(FORCE, 0.0), 0.05)
+    every = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(FORCE, 0.0), 0.05)
     turned, _ = np.linalg.qr(rng.standard_normal((every.size, every.size)))
     some = every.combined(turned[:, : every.size // 2])
     response = unseen_response(reduce_model(model, observed.nodes, some.basis), some)
     at_rest = model.solve(np.zeros_like(body.points))
-    whole = at_rest.push(every.basis)
-    both = np.hstack([at_rest.push(some.basis), response])
+    whole = at_rest.jvp(every.basis)
+    both = np.hstack([at_rest.jvp(some.basis), response])
     np.testing.assert_allclose(both @ both.T, whole @ whole.T, atol=1e-12 * np.abs(whole @ whole.T).max())
     fewer = some.combined(np.eye(some.size)[:, :2])
     response = unseen_response(reduce_model(model, observed.nodes, fewer.basis), fewer)
-    both = np.hstack([at_rest.push(fewer.basis), response])
+    both = np.hstack([at_rest.jvp(fewer.basis), response])
     np.testing.assert_allclose(both @ both.T, whole @ whole.T, atol=1e-12 * np.abs(whole @ whole.T).max())
     assert unseen_response(reduce_model(model, observed.nodes, every.basis), every).shape == (body.points.size, 0)
 
 
 def test_many_directions_are_stood_for_by_random_ones(body: Body) -> None:
     model, observed = Cantilever(body), SurfaceDistance(body, body.surfaces["observed"])
-    every = nodal_forces(body, body.boundary_nodes, Scale(FORCE, 0.0))
+    every = nodal_forces(body, body.boundary_nodes, LogNormalPrior(FORCE, 0.0))
     assert every.size > 200
     few = every.combined(np.eye(every.size)[:, :3])
     response = unseen_response(reduce_model(model, observed.nodes, few.basis), few)
     assert response.shape == (body.points.size, 64)
-    exact = model.solve(np.zeros_like(body.points)).push(few.unseen)
+    exact = model.solve(np.zeros_like(body.points)).jvp(few.unseen)
     ratio = np.trace(response @ response.T) / np.trace(exact @ exact.T)
     assert 0.5 < ratio < 1.6
 
@@ -200,14 +202,14 @@ def test_prepared_registrations_have_it(body: Body, rng: np.random.Generator) ->
 
 
 def replace_options(made: Registrar) -> Registrar:
-    options = replace(made.options, gathering=replace(made.options.gathering, rounds=1))
+    options = replace(made.options, localisation=replace(made.options.localisation, rounds=1))
     return Registrar(made.model, made.observed, made.forces, options)
 
 
 def test_who_is_called_converged_has_no_step_left(body: Body) -> None:
     """Closest points that are searched anew at the end may ask for another step: it is taken."""
     made = registrar(body)
-    made.noise = Scale(NOISE, 1.5, least=1e-4)
+    made.noise = LogNormalPrior(NOISE, 1.5, minimum=1e-4)
     for seed in range(40):
         rng = np.random.default_rng(seed)
         forces = made.forces.forces(FORCE * rng.standard_normal(made.forces.size))

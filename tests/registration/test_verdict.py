@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body
-from softtwin.registration.evidence import Scale
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import expected_force
+from softtwin.registration.priors import nodal_forces
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.unknowns import nodal_forces
 from softtwin.registration.verdict import Verdict, shared, thickness
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -18,7 +18,7 @@ from .conftest import Cantilever, cloud_on, tip_forces
 
 @pytest.fixture(scope="module")
 def registrar(body: Body) -> Registrar:
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 2.0, least=1e-4))
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 2.0, minimum=1e-4))
     return Registrar(Cantilever(body, learned=2.0), SurfaceDistance(body, body.surfaces["observed"]), forces)
 
 
@@ -89,7 +89,7 @@ def test_the_thickness_of_a_surface_and_of_a_space(rng) -> None:
 
 def test_a_load_beyond_what_was_learned_is_doubtful(body: Body, registrar: Registrar, rng) -> None:
     truth = registrar.model.solve(tip_forces(body, (0.0, 0.0, -1.4))).displacement
-    forces = nodal_forces(body, body.node_sets["tip"], Scale(0.05, 2.0, least=1e-4))
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 2.0, minimum=1e-4))
     small = Registrar(Cantilever(body, learned=0.5), SurfaceDistance(body, body.surfaces["observed"]), forces)
     refused(small, cloud_on(body, truth, 400, rng), "the surrogate has learned")
 

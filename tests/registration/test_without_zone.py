@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from softtwin.meshes.body import Body
-from softtwin.registration.options import Gathering, RegistrationOptions, options_for
+from softtwin.registration.options import RegistrationOptions, SparseLocalisation, options_for
 from softtwin.registration.registrar import prepare
 
 from .conftest import cloud_on, seen_from_above
@@ -21,13 +21,13 @@ class SpringState:
     displacement: np.ndarray
     inverse: np.ndarray
     negative_pivots: int | None = 0
-    extent: float | None = None
+    extrapolation_ratio: float | None = None
 
-    def push(self, changes: ArrayLike) -> np.ndarray:
+    def jvp(self, changes: ArrayLike) -> np.ndarray:
         moved = np.asarray(changes).reshape(len(self.inverse), -1)
         return (self.inverse @ moved).reshape(3 * len(self.inverse), -1)
 
-    def pull(self, cotangent: ArrayLike) -> np.ndarray:
+    def vjp(self, cotangent: ArrayLike) -> np.ndarray:
         return self.inverse.T @ np.asarray(cotangent)
 
 
@@ -69,14 +69,14 @@ def test_gathering_finds_the_place_and_the_state(rng, noise: float) -> None:
     truth = model.solve(forces).displacement
     cloud = cloud_on(body, truth, 500, rng, noise)
     errors, shares = [], []
-    for gathering in (Gathering(rounds=0), Gathering(rounds=3)):
+    for localisation in (SparseLocalisation(rounds=0), SparseLocalisation(rounds=3)):
         made = prepare(
             model,
             body.boundary_nodes,
             body.surfaces["observed"],
             force_scale=1e-2,
             smoothness=0.08,
-            options=RegistrationOptions(gathering=gathering),
+            options=RegistrationOptions(localisation=localisation),
         )
         result = made.register(cloud)
         # Along its own length a straight side slides freely: what is seen is what must be found.

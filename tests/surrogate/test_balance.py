@@ -45,8 +45,12 @@ def test_figures_are_those_of_each_prediction(surrogate: Surrogate, soft: DataSe
 
 def test_predictions_inside_out_are_counted_and_in_no_average(reduced: Surrogate, soft: DataSet) -> None:
     """Forty times too large and the other way: NaN must not hide in a mean."""
-    maps = replace(reduced.maps, left=-40.0 * reduced.maps.left, decode=-40.0 * reduced.maps.decode)
-    wild = Surrogate(reduced.body, maps, reduced.network, reduced.card)
+    encoder_decoder = replace(
+        reduced.encoder_decoder,
+        left=-40.0 * reduced.encoder_decoder.left,
+        decode=-40.0 * reduced.encoder_decoder.decode,
+    )
+    wild = Surrogate(reduced.body, encoder_decoder, reduced.network, reduced.card)
     figures = balance(wild, soft)
     assert 0 < figures.inside_out <= figures.samples
     assert figures.residual is None or np.isfinite(figures.residual.mean)
@@ -56,6 +60,6 @@ def test_predictions_inside_out_are_counted_and_in_no_average(reduced: Surrogate
 def test_what_cannot_be_judged_is_refused(reduced: Surrogate, data: DataSet) -> None:
     with pytest.raises(DataSetError, match="expected a known material"):
         balance(reduced, data)
-    other = Surrogate(beam((4, 2, 2), (0.4, 0.2, 0.3)), reduced.maps, reduced.network, reduced.card)
+    other = Surrogate(beam((4, 2, 2), (0.4, 0.2, 0.3)), reduced.encoder_decoder, reduced.network, reduced.card)
     with pytest.raises(ValueError, match=r"balance\.data: .* another body"):
         balance(other, data)

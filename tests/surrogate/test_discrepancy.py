@@ -30,8 +30,8 @@ def test_patterns_hold_most_of_held_out_errors(reduced: Surrogate, data: DataSet
 def test_their_size_is_that_of_the_errors(reduced: Surrogate, data: DataSet) -> None:
     """The covariance of the patterns has the trace of the validation errors, as far as it is not cut off."""
     missing = relative_errors(reduced, data, data.samples("validation"))
-    every = with_discrepancy(reduced, data, most=len(missing)).discrepancy
-    few = with_discrepancy(reduced, data, most=2).discrepancy
+    every = with_discrepancy(reduced, data, maximum=len(missing)).discrepancy
+    few = with_discrepancy(reduced, data, maximum=2).discrepancy
     np.testing.assert_allclose((every.modes**2).sum(), (missing**2).sum() / len(missing))
     assert few.modes.shape[1] == 2 and few.rest.sum() > every.rest.sum()
 
@@ -40,18 +40,18 @@ def test_one_error_far_above_the_others_does_not_speak_for_all(
     reduced: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A sample on another branch, say: it counts, as some times the median of the others."""
-    before = with_discrepancy(reduced, data, most=2)
+    before = with_discrepancy(reduced, data, maximum=2)
     missing = relative_errors(reduced, data, data.samples("validation"))
     missing[3] *= 1e3 * np.median(np.linalg.norm(missing, axis=1)) / np.linalg.norm(missing[3])
     monkeypatch.setattr(discrepancy, "relative_errors", lambda *_: missing)
-    after = with_discrepancy(reduced, data, most=2)
+    after = with_discrepancy(reduced, data, maximum=2)
     assert after.card["discrepancy"]["bounded"] == before.card["discrepancy"]["bounded"] + 1
     assert (after.discrepancy.modes**2).sum() < 10.0 * (before.discrepancy.modes**2).sum()
     assert (after.discrepancy.rest**2).sum() < 10.0 * (before.discrepancy.rest**2).sum()
 
 
 def test_a_saved_twin_keeps_them(reduced: Surrogate, data: DataSet, tmp_path: Path) -> None:
-    known = with_discrepancy(reduced, data, most=3)
+    known = with_discrepancy(reduced, data, maximum=3)
     save(known, tmp_path)
     again = load(tmp_path, known.body).discrepancy
     np.testing.assert_array_equal(again.modes, known.discrepancy.modes)

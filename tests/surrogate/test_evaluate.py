@@ -86,7 +86,7 @@ def test_cosine_of_known_angles() -> None:
 
 
 def test_a_surrogate_of_another_body_is_refused(reduced: Surrogate, data: DataSet) -> None:
-    other = Surrogate(beam((4, 2, 2), (0.4, 0.2, 0.3)), reduced.maps, reduced.network, reduced.card)
+    other = Surrogate(beam((4, 2, 2), (0.4, 0.2, 0.3)), reduced.encoder_decoder, reduced.network, reduced.card)
     with pytest.raises(ValueError, match="another body"):
         evaluate(other, data)
 
@@ -125,7 +125,7 @@ def test_errors_of_the_jacobian_are_those_of_its_columns(reduced: Surrogate, dat
         for column, entry in enumerate((3 * loaded[:, None] + np.arange(3)).ravel()):
             unit = np.zeros((data.body.points.size, 1))
             unit[entry] = 1.0
-            missed += float(((state.push(unit)[:, 0] - truth[:, column]) ** 2).sum())
+            missed += float(((state.jvp(unit)[:, 0] - truth[:, column]) ** 2).sum())
         expected.append(np.sqrt(missed) / np.linalg.norm(truth))
     np.testing.assert_allclose(jacobian_errors(reduced, data, samples, lambda c, u: truth), expected, rtol=1e-9)
     entries = (3 * loaded[:, None] + np.arange(3)).ravel()
@@ -136,6 +136,6 @@ def test_errors_of_the_jacobian_are_those_of_its_columns(reduced: Surrogate, dat
     def itself(columns: np.ndarray, displacement: np.ndarray) -> np.ndarray:
         forces = np.zeros_like(data.body.points)
         forces[loaded] = own[displacement.tobytes()]
-        return reduced.solve(forces).push(columns)
+        return reduced.solve(forces).jvp(columns)
 
     assert jacobian_errors(reduced, data, samples, itself).max() == 0.0

@@ -41,8 +41,8 @@ def untrained(kind: str, data: DataSet) -> Surrogate:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         samples = data.samples("train")
-        lesson = KINDS[kind].lesson(data, samples, samples)
-    return Surrogate(data.body, lesson.maps(), lesson.trained(), {"architecture": kind})
+        objective = KINDS[kind].objective(data, samples, samples)
+    return Surrogate(data.body, objective.encoder_decoder(), objective.trained(), {"architecture": kind})
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -74,19 +74,19 @@ def test_displacements_are_those_of_torch_in_batches_of_any_size(
         assert np.abs(graphs.solve(forces[:count]) - expected[:count]).max() < CLOSE * size
     assert np.abs(graphs.solve(forces[0]) - expected[0]).max() < CLOSE * size
     program = torch.export.load(folder / "value.pt2").module()
-    loads = torch.from_numpy(forces[:, surrogate.maps.loaded].reshape(len(forces), -1)).float()
+    loads = torch.from_numpy(forces[:, surrogate.encoder_decoder.loaded].reshape(len(forces), -1)).float()
     assert np.abs(program(loads).numpy().reshape(expected.shape) - expected).max() < CLOSE * size
 
 
 def test_jacobians_are_those_of_torch(pair: tuple[Surrogate, Path], forces: np.ndarray) -> None:
     surrogate, folder = pair
     graphs = ExportedTwin(folder)
-    rows = (3 * surrogate.maps.loaded[:, None] + np.arange(3)).ravel()
+    rows = (3 * surrogate.encoder_decoder.loaded[:, None] + np.arange(3)).ravel()
     coefficients = graphs.directions.T @ forces[1].ravel()[rows]
     load, columns = np.zeros(forces[1].size), np.zeros((forces[1].size, graphs.directions.shape[1]))
     load[rows], columns[rows] = graphs.directions @ coefficients, graphs.directions
     state = surrogate.solve(load.reshape(-1, 3))
-    expected = state.push(columns)
+    expected = state.jvp(columns)
     displacement, jacobian = graphs.linearised(coefficients)
     assert jacobian.shape[1] == 7 and np.abs(expected).max() > 0.0
     assert np.abs(displacement - state.displacement).max() < CLOSE * np.abs(state.displacement).max()
@@ -111,7 +111,7 @@ def test_directions_are_those_that_move_the_body_most(data: DataSet) -> None:
     found = leading_directions(surrogate, 4)
     np.testing.assert_allclose(found.T @ found, np.eye(4), atol=1e-12)
     other = np.linalg.qr(np.random.default_rng(0).standard_normal(found.shape))[0]
-    moved = [np.linalg.norm(surrogate.maps.linear(basis)) for basis in (found, other)]
+    moved = [np.linalg.norm(surrogate.encoder_decoder.linear(basis)) for basis in (found, other)]
     assert moved[0] > 3.0 * moved[1]
     with pytest.raises(ValueError, match=r"leading_directions\.count: expected at least 1, got 0"):
         leading_directions(surrogate, 0)

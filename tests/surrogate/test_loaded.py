@@ -12,7 +12,7 @@ from softtwin.surrogate.model import Surrogate
 
 def some_forces(surrogate: Surrogate, scale: float, seed: int) -> np.ndarray:
     whole = np.zeros_like(surrogate.body.points)
-    loaded = surrogate.maps.loaded
+    loaded = surrogate.encoder_decoder.loaded
     whole[loaded] = scale * np.random.default_rng(seed).standard_normal((len(loaded), 3))
     return whole
 
@@ -40,7 +40,7 @@ def test_reduced_it_agrees_with_the_whole(reduced: Surrogate, known: np.ndarray,
     c = 0.1 * np.abs(known).max() * rng.standard_normal(3)
     state, whole = small.solve(c), model.solve((basis @ turned @ c).reshape(-1, 3))
     picked = (3 * nodes[:, None] + np.arange(3)).ravel()
-    pushed = whole.push(basis @ turned)[picked]
+    pushed = whole.jvp(basis @ turned)[picked]
     assert small.count == 3 and state.jacobian(rows).shape == (21, 3)
     np.testing.assert_allclose(state.positions, whole.displacement[nodes], atol=1e-5 * np.abs(whole.displacement).max())
     np.testing.assert_allclose(state.jacobian(rows), pushed, atol=1e-5 * np.abs(pushed).max())
@@ -51,7 +51,9 @@ def test_reduced_it_agrees_with_the_whole(reduced: Surrogate, known: np.ndarray,
 
 
 def test_forces_where_it_has_never_seen_any_are_refused(reduced: Surrogate) -> None:
-    idle = np.setdiff1d(np.arange(len(reduced.body.points)), np.union1d(reduced.maps.loaded, reduced.body.fixed))
+    idle = np.setdiff1d(
+        np.arange(len(reduced.body.points)), np.union1d(reduced.encoder_decoder.loaded, reduced.body.fixed)
+    )
     inside = np.zeros_like(reduced.body.points)
     inside[idle[0]] = [0.0, 0.0, 1.0]
     with pytest.raises(ValueError, match="nodes that carried load in training"):

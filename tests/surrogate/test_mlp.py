@@ -37,8 +37,8 @@ def test_the_activation_stands_after_each_layer(activation: Activation) -> None:
     for layer in network.hidden:
         expected = FORMULAS[activation](expected @ layer.weight.numpy().T + layer.bias.numpy())
     np.testing.assert_allclose(network(torch.from_numpy(given)).numpy(), expected, rtol=1e-12, atol=1e-15)
-    revived = Perceptron.revived(network.state_dict())
-    assert torch.equal(revived(torch.from_numpy(given)), network(torch.from_numpy(given)))
+    from_state_dict = Perceptron.from_state_dict(network.state_dict())
+    assert torch.equal(from_state_dict(torch.from_numpy(given)), network(torch.from_numpy(given)))
 
 
 def test_twins_that_say_none_have_relu() -> None:
@@ -46,7 +46,7 @@ def test_twins_that_say_none_have_relu() -> None:
     names = {"first.bias", "hidden.0.weight", "hidden.0.bias", "hidden.1.weight", "hidden.1.bias"}
     network = HiddenLayers(6)
     assert set(network.state_dict()) == names
-    assert Perceptron.revived(network.state_dict()).activation == "relu"
+    assert Perceptron.from_state_dict(network.state_dict()).activation == "relu"
 
 
 def test_card_checkpoint_and_twin_keep_it(data: DataSet, tmp_path: Path, forces: np.ndarray) -> None:

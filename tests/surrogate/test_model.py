@@ -24,7 +24,7 @@ STEPS = 0.5 ** np.arange(3, 8)
 
 def _direction(surrogate: Surrogate, seed: int, scale: float) -> np.ndarray:
     direction = np.zeros_like(surrogate.body.points)
-    loaded = surrogate.maps.loaded
+    loaded = surrogate.encoder_decoder.loaded
     direction[loaded] = scale * np.random.default_rng(seed).standard_normal((len(loaded), 3))
     return direction
 
@@ -37,7 +37,7 @@ def _rates(remainders: list[float]) -> np.ndarray:
 def test_push_is_the_derivative(reduced: Surrogate, forces: np.ndarray) -> None:
     direction = _direction(reduced, 0, np.abs(forces).max())
     start = reduced.solve(forces)
-    slope = start.push(direction.reshape(-1, 1)).reshape(-1, 3)
+    slope = start.jvp(direction.reshape(-1, 1)).reshape(-1, 3)
     moved = [reduced.solve(forces + h * direction).displacement for h in STEPS]
     remainders = [np.linalg.norm(u - start.displacement - h * slope) for h, u in zip(STEPS, moved, strict=True)]
     assert _rates(remainders)[-1] == pytest.approx(2.0, abs=0.1)
@@ -47,7 +47,7 @@ def test_pull_is_the_gradient(reduced: Surrogate, forces: np.ndarray) -> None:
     """Of the squared misfit, whose gradient with respect to the displacement is the displacement."""
     direction = _direction(reduced, 1, np.abs(forces).max())
     start = reduced.solve(forces)
-    slope = float(np.vdot(start.pull(start.displacement), direction))
+    slope = float(np.vdot(start.vjp(start.displacement), direction))
     value = 0.5 * float(np.vdot(start.displacement, start.displacement))
     moved = [reduced.solve(forces + h * direction).displacement for h in STEPS]
     remainders = [abs(0.5 * float(np.vdot(u, u)) - value - h * slope) for h, u in zip(STEPS, moved, strict=True)]
@@ -57,7 +57,7 @@ def test_pull_is_the_gradient(reduced: Surrogate, forces: np.ndarray) -> None:
 def test_perceptron_is_linear_between_its_kinks(perceptron: Surrogate, forces: np.ndarray) -> None:
     direction = _direction(perceptron, 2, 1e-7 * np.abs(forces).max())
     start = perceptron.solve(forces)
-    slope = start.push(direction.reshape(-1, 1)).reshape(-1, 3)
+    slope = start.jvp(direction.reshape(-1, 1)).reshape(-1, 3)
     change = perceptron.solve(forces + direction).displacement - start.displacement
     # what cancels in the difference: round-off of values seven decades above it
     assert np.linalg.norm(change - slope) < 1e-6 * np.linalg.norm(change)
@@ -67,18 +67,18 @@ def test_a_push_of_changes_that_were_written_over_is_a_new_one(surrogate: Surrog
     """What does not depend on the state is remembered between pushes."""
     columns = np.stack([_direction(surrogate, seed, 1.0).ravel() for seed in range(3)], axis=1)
     states = surrogate.solve(forces), surrogate.solve(0.5 * forces)
-    before = [state.push(columns) for state in states]
+    before = [state.jvp(columns) for state in states]
     columns *= 2.0
     for state, once in zip(states, before, strict=True):
-        assert np.abs(state.push(columns) - 2.0 * once).max() < 1e-12 * np.abs(once).max()
+        assert np.abs(state.jvp(columns) - 2.0 * once).max() < 1e-12 * np.abs(once).max()
 
 
 def test_push_and_pull_are_adjoint(surrogate: Surrogate, forces: np.ndarray) -> None:
     state = surrogate.solve(forces)
     columns = np.stack([_direction(surrogate, seed, 1.0).ravel() for seed in range(3)], axis=1)
     cotangent = np.random.default_rng(9).standard_normal(surrogate.body.points.shape)
-    forward = cotangent.ravel() @ state.push(columns)
-    backward = state.pull(cotangent).ravel() @ columns
+    forward = cotangent.ravel() @ state.jvp(columns)
+    backward = state.vjp(cotangent).ravel() @ columns
     assert np.abs(forward).min() > 0.0
     assert np.abs(forward - backward).max() < 1e-11 * np.abs(forward).max()
 
@@ -87,17 +87,17 @@ def test_many_columns_at_once_equal_few(surrogate: Surrogate, forces: np.ndarray
     """More columns than the network has coordinates take another way."""
     state = surrogate.solve(forces)
     columns = np.stack([_direction(surrogate, seed, 1.0).ravel() for seed in range(200)], axis=1)
-    together = state.push(columns)
-    apart = np.concatenate([state.push(columns[:, i : i + 1]) for i in range(200)], axis=1)
+    together = state.jvp(columns)
+    apart = np.concatenate([state.jvp(columns[:, i : i + 1]) for i in range(200)], axis=1)
     assert np.abs(together - apart).max() < 1e-11 * np.abs(apart).max()
 
 
 def test_a_state_stays_what_it_was(reduced: Surrogate, forces: np.ndarray) -> None:
     state = reduced.solve(forces)
-    before, pulled = state.displacement.copy(), state.pull(forces)
+    before, pulled = state.displacement.copy(), state.vjp(forces)
     other = reduced.solve(-2.0 * forces)
-    assert np.array_equal(state.displacement, before) and np.array_equal(state.pull(forces), pulled)
-    assert np.abs(other.pull(forces) - pulled).max() > 1e-3 * np.abs(pulled).max()
+    assert np.array_equal(state.displacement, before) and np.array_equal(state.vjp(forces), pulled)
+    assert np.abs(other.vjp(forces) - pulled).max() > 1e-3 * np.abs(pulled).max()
 
 
 def test_the_reduced_surrogate_agrees_with_the_whole(surrogate: Surrogate, forces: np.ndarray) -> None:
@@ -106,7 +106,7 @@ def test_the_reduced_surrogate_agrees_with_the_whole(surrogate: Surrogate, force
     c = np.array([0.3, -0.2, 0.5, 0.1])
     few = surrogate.reduced(nodes, basis).solve(c)
     whole = surrogate.solve((basis @ c).reshape(-1, 3))
-    pushed = whole.push(basis).reshape(-1, 3, 4)[nodes].reshape(-1, 4)
+    pushed = whole.jvp(basis).reshape(-1, 3, 4)[nodes].reshape(-1, 4)
     size = np.abs(whole.displacement).max()
     assert np.abs(few.full.displacement - whole.displacement).max() < 1e-11 * size
     # The rest is taken in single precision.
@@ -138,17 +138,17 @@ def test_a_reduced_surrogate_takes_combinations_of_its_basis(surrogate: Surrogat
 
 
 def test_extent_is_one_at_the_farthest_load_of_the_training(reduced: Surrogate, data: DataSet) -> None:
-    assert reduced.solve(np.zeros_like(reduced.body.points)).extent is None
+    assert reduced.solve(np.zeros_like(reduced.body.points)).extrapolation_ratio is None
     known = with_domain(reduced, data)
     extents, distances = [], []
     for loads in data.samples("train").forces:
         forces = np.zeros_like(known.body.points)
         forces[data.response.loaded] = loads
-        extents.append(known.solve(forces).extent)
+        extents.append(known.solve(forces).extrapolation_ratio)
         distances.append(known.solve(forces).distance)
     assert max(extents) == pytest.approx(1.0, abs=0.2) and min(extents) < 0.9
     assert max(distances) == pytest.approx(1.0) and min(distances) < 0.9
-    assert known.solve(3.0 * forces).extent > 2.0 * known.solve(forces).extent
+    assert known.solve(3.0 * forces).extrapolation_ratio > 2.0 * known.solve(forces).extrapolation_ratio
     assert known.solve(3.0 * forces).distance == pytest.approx(3.0 * known.solve(forces).distance)
 
 
@@ -157,16 +157,20 @@ def test_a_state_says_whether_its_load_was_learned(reduced: Surrogate, data: Dat
     assert reduced.solve(forces).is_inside is None is reduced.solve(forces).distance
     known = with_domain(reduced, data)
     domain, state = known.card["domain"], known.solve(forces)
-    assert state.is_inside == (state.extent <= 1.0)
+    assert state.is_inside == (state.extrapolation_ratio <= 1.0)
     far = known.solve(1.5 / state.distance * forces)
     assert far.distance == pytest.approx(1.5) and far.is_inside is False
     largest = np.linalg.norm(state.displacement, axis=1).max()
     stiff = known.with_card(domain={**domain, "displacement_m": largest / 2.0}).solve(forces)
-    assert stiff.distance == state.distance < 1.0 and stiff.extent == pytest.approx(2.0) and stiff.is_inside is False
+    assert (
+        stiff.distance == state.distance < 1.0
+        and stiff.extrapolation_ratio == pytest.approx(2.0)
+        and stiff.is_inside is False
+    )
 
 
 def test_forces_where_none_were_trained_are_refused_by_name(surrogate: Surrogate) -> None:
-    inside = int(np.setdiff1d(surrogate.body.free, surrogate.maps.loaded)[0])
+    inside = int(np.setdiff1d(surrogate.body.free, surrogate.encoder_decoder.loaded)[0])
     bad = np.zeros_like(surrogate.body.points)
     bad[inside, 1] = 1e-9
     with pytest.raises(ValueError, match=rf"1 other nodes, first \[{inside}\]"):
@@ -186,7 +190,7 @@ def test_wrong_shapes_are_refused(surrogate: Surrogate) -> None:
     with pytest.raises(ValueError, match=r"forces: expected shape \(45, 3\), got \(3,\)"):
         surrogate.solve(np.zeros(3))
     with pytest.raises(ValueError, match=rf"changes: expected shape \({count}, k\)"):
-        surrogate.solve(np.zeros_like(surrogate.body.points)).push(np.zeros((4, 2)))
+        surrogate.solve(np.zeros_like(surrogate.body.points)).jvp(np.zeros((4, 2)))
     with pytest.raises(ValueError, match=r"nodes: expected 0\.\.44, got 0\.\.45"):
         surrogate.reduced([0, 45], np.zeros((count, 2)))
     with pytest.raises(ValueError, match=r"coefficients: expected shape \(2,\), got \(3,\)"):
@@ -203,7 +207,7 @@ def test_a_loaded_surrogate_is_the_saved_one_bit_by_bit(
     again = load(tmp_path / "twin", surrogate.body)
     before, after = surrogate.solve(forces), again.solve(forces)
     assert np.array_equal(after.displacement, before.displacement)
-    assert np.array_equal(after.pull(forces), before.pull(forces))
+    assert np.array_equal(after.vjp(forces), before.vjp(forces))
     assert again.card["architecture"] == surrogate.card["architecture"]
     assert {path.name for path in (tmp_path / "twin").iterdir()} == {WEIGHTS, CARD}
 

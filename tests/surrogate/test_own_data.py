@@ -16,7 +16,7 @@ from softtwin.surrogate.balance import balance
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.evaluate import evaluate, table
-from softtwin.surrogate.own_data import data_set_from_arrays
+from softtwin.surrogate.from_arrays import data_set_from_arrays
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.residual import ElasticBody

@@ -13,7 +13,7 @@ from softtwin.reference.data.dataset import DataSet, DataSetError
 from softtwin.surrogate.architecture import Architecture
 from softtwin.surrogate.checkpoint import CheckpointError
 from softtwin.surrogate.mlp import Perceptron
-from softtwin.surrogate.physics import Physics, PhysicsLesson
+from softtwin.surrogate.physics import Physics, PhysicsObjective
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.residual import ElasticBody
@@ -32,30 +32,30 @@ def soft(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> DataSet:
 
 
 @pytest.fixture(params=KINDS)
-def lesson(request: pytest.FixtureRequest, soft: DataSet) -> Any:
+def objective(request: pytest.FixtureRequest, soft: DataSet) -> Any:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        return KINDS[request.param].lesson(soft, soft.samples("train"), soft.samples("validation"))
+        return KINDS[request.param].objective(soft, soft.samples("train"), soft.samples("validation"))
 
 
-def test_the_terms_are_those_of_the_body(lesson: Any, soft: DataSet) -> None:
+def test_the_terms_are_those_of_the_body(objective: Any, soft: DataSet) -> None:
     """Against the body in double precision; the weight of each term is the one asked for."""
     batch = torch.tensor([0, 3, 5])
-    displacement, forces = (fields.detach().double() for fields in lesson.fields(batch))
+    displacement, forces = (fields.detach().double() for fields in objective.fields(batch))
     truth = ElasticBody(soft.body, soft.material)
     free = displacement * truth.free
     loaded = soft.response.loaded
     work = np.array([0.5 * np.vdot(b, soft.response.apply(b[None])[0][loaded]) for b in forces[:, loaded].numpy()])
-    every = lesson.fields(torch.arange(min(lesson.sample_count, 256)))[1].double().numpy()[:, loaded]
+    every = objective.fields(torch.arange(min(objective.sample_count, 256)))[1].double().numpy()[:, loaded]
     usual = np.mean([0.5 * np.vdot(b, soft.response.apply(b[None])[0][loaded]) for b in every])
     energies = truth.potential(free, forces).numpy() / (np.sqrt(work * usual) + 0.01 * usual)
     residuals = truth.residual(free, forces).numpy() ** 2
     moved = soft.response.apply(every)
     held = float((displacement - free).square().mean()) / (moved**2).mean()
-    own = float(lesson.loss(batch).detach())
+    own = float(objective.loss(batch).detach())
 
     def loss(**weights: float) -> float:
-        return float(PhysicsLesson(lesson, soft, Physics(**weights)).loss(batch).detach())
+        return float(PhysicsObjective(objective, soft, Physics(**weights)).loss(batch).detach())
 
     assert min(truth.jacobians(free).min(), 1.0) > 0.1, "the loss is the body's own where no cell is nearly inside out"
     assert loss(data=2.0) == pytest.approx(2.0 * own, rel=1e-6)
@@ -66,13 +66,13 @@ def test_the_terms_are_those_of_the_body(lesson: Any, soft: DataSet) -> None:
     assert loss(energy=0.5, residual=0.1) == pytest.approx(mixed, rel=1e-4)
 
 
-def test_a_fresh_network_that_turns_cells_inside_out_still_learns(lesson: Any, soft: DataSet) -> None:
-    wild = PhysicsLesson(lesson, soft, Physics(energy=1.0, residual=1.0, data=0.0))
+def test_a_fresh_network_that_turns_cells_inside_out_still_learns(objective: Any, soft: DataSet) -> None:
+    wild = PhysicsObjective(objective, soft, Physics(energy=1.0, residual=1.0, data=0.0))
     with torch.no_grad():
         for weights in wild.network.parameters():
             weights.mul_(8.0)
     batch = torch.arange(8)
-    displacement = lesson.fields(batch)[0].detach()
+    displacement = objective.fields(batch)[0].detach()
     assert float(wild.body.jacobians(displacement * wild.body.free).min()) < 0.0
     loss = wild.loss(batch)
     loss.backward()
@@ -89,7 +89,7 @@ def test_energy_alone_brings_the_network_nearer_to_balance(kind: str, soft: Data
     truth = ElasticBody(soft.body, soft.material)
 
     def energy(physics: Physics | None) -> float:
-        plan = TrainingPlan(KINDS[kind], epochs=60, batch=16, physics=physics)
+        plan = TrainingPlan(KINDS[kind], epochs=30, batch=16, physics=physics)
         surrogate = train(soft, plan)
         found = torch.from_numpy(np.stack([surrogate.solve(b).displacement for b in forces]))
         return float(truth.potential(found * truth.free, torch.from_numpy(forces)).mean())

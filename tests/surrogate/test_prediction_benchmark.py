@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,27 +10,29 @@ import torch
 
 prediction = pytest.importorskip("prediction", reason="torch is absent")
 
+import harness
 from record import recorded
+from repository import Repository
 
 from softtwin.reference.data.dataset import DataSet
 
 
 @pytest.fixture
 def quick(tmp_path: Path, data: DataSet, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Few calls, small batches, no look at what the machine can do; records in place of those that are kept."""
-    monkeypatch.setattr("record.RESULTS", tmp_path / "records")
+    """Few calls, small batches, no look at what the machine can do; a repository in place of this one."""
+    Repository(tmp_path / "code", monkeypatch)
     for name, value in {"LEAST_SECONDS": 0.0, "BATCHES": (1, 2), "CHANNELS": 2}.items():
         monkeypatch.setattr(prediction, name, value)
     limits = {"operations_per_s": 1e12, "bytes_per_s": 1e12, "cached_bytes_per_s": 1e12}
     monkeypatch.setattr(prediction, "peak", lambda device: limits)
-    monkeypatch.setattr(sys, "argv", ["prediction.py", "--data", str(data.path), "--device", "cpu"])
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
 
 
-def test_every_network_is_timed_once(quick: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    prediction.main()
+def test_every_network_is_timed_once(quick: None, data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["--data", str(data.path), "--device", "cpu"]
+    harness.run(prediction.BENCHMARK, words)
     found = recorded("prediction")
     assert found["device"] == "one CPU thread"
     assert set(found["networks"]) == {"reduced", "mlp", "umesh, 2 channels", "transolver"}
@@ -41,5 +42,5 @@ def test_every_network_is_timed_once(quick: None, monkeypatch: pytest.MonkeyPatc
         assert set(figures["batches"]) == {"1", "2"}
         assert figures["off"]["fast"] < 1e-6 and set(figures["push_ms"]) == {"own", "torch.func"}
     monkeypatch.setattr(prediction, "measured", None)
-    prediction.main()
+    harness.run(prediction.BENCHMARK, words)
     assert recorded("prediction") == found

@@ -17,7 +17,7 @@ from softtwin.surrogate import reduced as reduced_module
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.pod import correction_modes, learned_basis
-from softtwin.surrogate.reduced import Reduced, ReducedLesson
+from softtwin.surrogate.reduced import Reduced, ReducedObjective
 from softtwin.surrogate.symmetry import identity, symmetries
 from softtwin.surrogate.train import train
 
@@ -28,10 +28,10 @@ def _loaded(body: Body) -> np.ndarray:
     return np.setdiff1d(body.boundary_nodes, body.fixed)
 
 
-def _lesson(data: DataSet, use_symmetries: bool = True) -> ReducedLesson:
+def _lesson(data: DataSet, use_symmetries: bool = True) -> ReducedObjective:
     torch.manual_seed(0)
     samples = data.samples("train")
-    return Reduced(modes=6, width=24, depth=2, symmetries=use_symmetries).lesson(data, samples, samples)
+    return Reduced(modes=6, width=24, depth=2, symmetries=use_symmetries).objective(data, samples, samples)
 
 
 @pytest.mark.parametrize(
@@ -102,22 +102,22 @@ def test_snapshots_that_are_all_zero_are_refused(small_beam: Body) -> None:
 
 def test_reduced_loss_is_the_full_loss_up_to_a_constant(data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
     """Differences of the loss between two networks agree with those of the loss in all 3n unknowns."""
-    lesson = _lesson(data, use_symmetries=False)
+    objective = _lesson(data, use_symmetries=False)
     samples = data.samples("train")
     batch = torch.arange(len(samples))
     monkeypatch.setattr(reduced_module, "_SHARE", 1)  # the gradient's loss over all samples
     reduced, full = [], []
     for scale in (0.3, 1.0):
-        lesson.network.output_scale.fill_(scale)
-        reduced.append(lesson.loss(batch).item())
-        full.append(_full_loss(data, lesson))
+        objective.network.output_scale.fill_(scale)
+        reduced.append(objective.loss(batch).item())
+        full.append(_full_loss(data, objective))
     assert abs(reduced[1] - reduced[0]) > 1e-2 * reduced[1]
     # float32 sums of losses of this size
     assert reduced[1] - reduced[0] == pytest.approx(full[1] - full[0], abs=1e-4 * reduced[1])
 
 
-def _full_loss(data: DataSet, lesson: ReducedLesson) -> float:
-    samples, network, basis = data.samples("train"), lesson.trained(), lesson.basis
+def _full_loss(data: DataSet, objective: ReducedObjective) -> float:
+    samples, network, basis = data.samples("train"), objective.trained(), objective.basis
     flat = samples.displacements.reshape(len(samples), -1)
     rms = np.sqrt((flat**2).sum(axis=1).mean())
     total = 0.0
@@ -129,7 +129,7 @@ def _full_loss(data: DataSet, lesson: ReducedLesson) -> float:
         nodes = data.body.boundary_nodes
         cotangent[nodes] = np.tensordot(samples.probes[i], data.shapes[:, nodes], axes=1)
         gradient = cotangent.ravel() @ data.response.left @ data.response.right
-        gradient = gradient + here.pull(torch.from_numpy(cotangent.ravel() @ basis.modes)).numpy() @ basis.restricted.T
+        gradient = gradient + here.vjp(torch.from_numpy(cotangent.ravel() @ basis.modes)).numpy() @ basis.restricted.T
         missed = np.sum((gradient - samples.adjoints[i].ravel()) ** 2) / np.sum(samples.adjoints[i] ** 2)
         total += error @ error / (np.linalg.norm(flat[i]) * rms + 0.01 * rms**2) + 0.03 * missed
     return total / len(samples)
@@ -148,12 +148,12 @@ def test_fixed_nodes_never_move(reduced: Surrogate, forces: np.ndarray) -> None:
 def test_tangent_at_rest_is_the_linear_response(reduced: Surrogate, data: DataSet, forces: np.ndarray) -> None:
     linear = data.response.apply(forces[None, data.response.loaded])[0]
     rest = reduced.solve(np.zeros_like(forces))
-    found = rest.push(forces.reshape(-1, 1)).reshape(-1, 3)
+    found = rest.jvp(forces.reshape(-1, 1)).reshape(-1, 3)
     assert np.abs(found - linear).max() <= 1e-14 * np.abs(linear).max()
 
 
 def test_prediction_turns_with_the_load(reduced: Surrogate, forces: np.ndarray) -> None:
-    group = symmetries(reduced.body, reduced.maps.loaded)
+    group = symmetries(reduced.body, reduced.encoder_decoder.loaded)
     assert len(group) == 8
     expected = reduced.solve(forces).displacement
     for motion in group:
@@ -185,15 +185,15 @@ def differentiated(make_data: Any) -> DataSet:
 
 def test_the_loss_of_jacobians_is_their_frobenius_error(differentiated: DataSet) -> None:
     """Over all directions of a basis in place of random ones, for samples and their images."""
-    lesson = _lesson(differentiated)
-    modes, rows = lesson.basis.modes, lesson.basis.restricted
+    objective = _lesson(differentiated)
+    modes, rows = objective.basis.modes, objective.basis.restricted
     count = len(differentiated.samples("train"))
-    assert lesson.whole and lesson.basis.count == 6 and lesson.sample_count == 8 * count
+    assert objective.whole and objective.basis.count == 6 and objective.sample_count == 8 * count
     batch = torch.tensor([3, count + 3, 5 * count + 7])
     found = 0.0
     for shift in range(6):
-        lesson.directions = torch.roll(torch.eye(6), shift, 0)
-        found += float(lesson._jacobian_loss(batch).detach())
+        objective.directions = torch.roll(torch.eye(6), shift, 0)
+        found += float(objective._jacobian_loss(batch).detach())
     train, truth = differentiated.samples("train"), ClosedForm(differentiated.body)
     group, expected = symmetries(differentiated.body, differentiated.response.loaded), 0.0
     for number in batch.tolist():
@@ -202,8 +202,8 @@ def test_the_loss_of_jacobians_is_their_frobenius_error(differentiated: DataSet)
         load = motion.apply(forces)[0]
         columns = np.stack([truth.adjoint(load, mode.reshape(-1, 3)).ravel() for mode in modes.T], axis=1)
         at = (3 * differentiated.response.loaded[:, None] + np.arange(3)).ravel()
-        missing = columns[at] - (lesson.response.left @ lesson.response.right).T @ modes
-        single = lesson.network.double()
+        missing = columns[at] - (objective.response.left @ objective.response.right).T @ modes
+        single = objective.network.double()
         coordinates = torch.from_numpy(rows.T @ load.ravel()[at])[None]
         jacobian = torch.func.jacrev(lambda x, net=single: net(x)[0])(coordinates)[:, 0].detach().numpy()
         part = missing - rows @ np.linalg.lstsq(rows, missing, rcond=None)[0]  # what no network between these can have
@@ -227,7 +227,7 @@ def test_jacobians_are_learned_from(differentiated: DataSet, data: DataSet) -> N
             forces = np.zeros_like(data.body.points)
             forces[loaded] = given
             exact = np.stack([truth.adjoint(forces, m.reshape(-1, 3)).ravel() for m in modes.T]) @ columns
-            missed = modes.T @ surrogate.solve(forces).push(columns) - exact
+            missed = modes.T @ surrogate.solve(forces).jvp(columns) - exact
             found.append(np.linalg.norm(missed) / np.linalg.norm(exact))
         return float(np.median(found))
 
@@ -252,5 +252,5 @@ def test_jacobians_that_are_not_finite_are_refused(differentiated: DataSet, name
 def test_fewer_modes_than_the_jacobians_are_of_are_refused(differentiated: DataSet) -> None:
     samples = differentiated.samples("train")
     with pytest.raises(ValueError, match=r"Reduced\.modes: expected at least the 6 .* got 4"):
-        Reduced(modes=4).lesson(differentiated, samples, samples)
-    assert not Reduced(modes=4, sobolev=0.0).lesson(differentiated, samples, samples).whole
+        Reduced(modes=4).objective(differentiated, samples, samples)
+    assert not Reduced(modes=4, sobolev=0.0).objective(differentiated, samples, samples).whole

@@ -14,12 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from softtwin.reference.data.dataset import DataSet, DataSetError
-from softtwin.reference.data.writing import drop_block
-from softtwin.surrogate import course as training
+from softtwin.reference.data.dataset import DataSet, DataSetError, drop_block
+from softtwin.surrogate import training_module as training
 from softtwin.surrogate.architecture import Architecture
 from softtwin.surrogate.checkpoint import CHECKPOINT, VERSION, CheckpointError
-from softtwin.surrogate.course import Course, Diverged, chosen_device, fit, rate_factor
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
@@ -29,6 +27,7 @@ from softtwin.surrogate.precision import without_tf32
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.registry import ARCHITECTURES
 from softtwin.surrogate.train import train
+from softtwin.surrogate.training_module import Diverged, TrainingModule, chosen_device, fit, rate_factor
 from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
 
@@ -61,7 +60,7 @@ class Ticking:
 def _weights(surrogate: Surrogate) -> dict[str, np.ndarray]:
     return {
         name: np.asarray(tensor)
-        for name, tensor in [*surrogate.network.state_dict().items(), *surrogate.maps.arrays().items()]
+        for name, tensor in [*surrogate.network.state_dict().items(), *surrogate.encoder_decoder.arrays().items()]
     }
 
 
@@ -71,14 +70,14 @@ def _same(a: Surrogate, b: Surrogate) -> bool:
 
 
 def _stop_in_round(monkeypatch: pytest.MonkeyPatch, number: int, act: Any) -> None:
-    original = Course.on_train_epoch_start
+    original = TrainingModule.on_train_epoch_start
 
-    def stopping(self: Course) -> None:
+    def stopping(self: TrainingModule) -> None:
         original(self)
         if self.current_epoch == number:
             act()
 
-    monkeypatch.setattr(Course, "on_train_epoch_start", stopping)
+    monkeypatch.setattr(TrainingModule, "on_train_epoch_start", stopping)
 
 
 @pytest.mark.parametrize(
@@ -90,11 +89,11 @@ def test_four_samples_are_learnt_by_heart(data: DataSet, tmp_path: Path, archite
     plan = TrainingPlan(architecture, samples=4, epochs=240)
     four = data.samples("train", 4)
     torch.manual_seed(0)
-    lesson = architecture.lesson(data, four, four)
-    course = Course(lesson, plan, "")
-    start = lesson.error()
-    fit(course, tmp_path / CHECKPOINT, False)
-    assert course.best_error < 0.02 * start
+    objective = architecture.objective(data, four, four)
+    training_module = TrainingModule(objective, plan, "")
+    start = objective.error()
+    fit(training_module, tmp_path / CHECKPOINT, False)
+    assert training_module.best_error < 0.02 * start
 
 
 def test_the_reduced_network_beats_the_linear_response_on_unseen_samples(reduced: Surrogate, data: DataSet) -> None:
@@ -187,13 +186,13 @@ def test_mixed_precision_learns_too(data: DataSet) -> None:
 def test_single_precision_is_without_tf32(
     data: DataSet, short: TrainingPlan, monkeypatch: pytest.MonkeyPatch, precision: Any, allowed: bool
 ) -> None:
-    seen, step = set(), Course.training_step
+    seen, step = set(), TrainingModule.training_step
 
-    def looking(course: Course, batch: Any, number: int) -> Any:
+    def looking(training_module: TrainingModule, batch: Any, number: int) -> Any:
         seen.add((torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32))
-        return step(course, batch, number)
+        return step(training_module, batch, number)
 
-    monkeypatch.setattr(Course, "training_step", looking)
+    monkeypatch.setattr(TrainingModule, "training_step", looking)
     with without_tf32(False):  # it brings back what was
         torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
         train(data, replace(short, precision=precision))
@@ -205,13 +204,13 @@ def test_single_precision_is_without_tf32(
 def test_bfloat16_on_a_processor_is_without_onednn(
     data: DataSet, short: TrainingPlan, monkeypatch: pytest.MonkeyPatch, precision: Any, allowed: bool
 ) -> None:
-    seen, step = set(), Course.training_step
+    seen, step = set(), TrainingModule.training_step
 
-    def looking(course: Course, batch: Any, number: int) -> Any:
+    def looking(training_module: TrainingModule, batch: Any, number: int) -> Any:
         seen.add(torch.backends.mkldnn.enabled)
-        return step(course, batch, number)
+        return step(training_module, batch, number)
 
-    monkeypatch.setattr(Course, "training_step", looking)
+    monkeypatch.setattr(TrainingModule, "training_step", looking)
     assert torch.backends.mkldnn.enabled
     train(data, replace(short, precision=precision, device="cpu"))
     assert seen == {allowed}
@@ -367,6 +366,22 @@ def test_a_checkpoint_of_another_architecture_is_refused(data: DataSet, short: T
         train(data, replace(short, architecture=Perceptron()), tmp_path)
 
 
+def test_a_checkpoint_goes_on_whose_weights_have_their_earlier_name(
+    data: DataSet, short: TrainingPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The objective was called lesson."""
+    with monkeypatch.context() as patch:
+        _stop_in_round(patch, 3, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        with pytest.raises(SystemExit):
+            train(data, short, tmp_path)
+    checkpoint = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    weights = checkpoint["state_dict"]
+    assert weights and all(name.startswith("objective.") for name in weights)
+    checkpoint["state_dict"] = {name.replace("objective.", "lesson.", 1): value for name, value in weights.items()}
+    torch.save(checkpoint, tmp_path / CHECKPOINT)
+    assert _same(train(data, short, tmp_path), train(data, short))
+
+
 @pytest.mark.parametrize("version", [1, VERSION + 1])
 def test_a_checkpoint_of_another_version_is_refused(
     data: DataSet, short: TrainingPlan, tmp_path: Path, version: int
@@ -432,7 +447,7 @@ def test_training_that_gets_no_better_ends_early(
 ) -> None:
     """Ten times the rate that is good for it: the error soon stays above its least. Each round leaves a line."""
     monkeypatch.setattr(training, "ROUNDS", 40)
-    plan = replace(small_plan, epochs=200, learning_rate=0.05)
+    plan = replace(small_plan, epochs=80, learning_rate=0.05)
     whole = train(data, plan)
     short = train(data, replace(plan, patience=3), tmp_path)
     assert short.card["training"]["steps"] < whole.card["training"]["steps"]

@@ -115,22 +115,22 @@ def sparse(write_data: Any, tmp_path_factory: pytest.TempPathFactory) -> DataSet
 def test_what_the_grid_holds_outside_of_the_body_is_not_learned_from(sparse: DataSet) -> None:
     """A masked loss: neither its value nor its derivative knows of the tensor where no node stands."""
     samples = sparse.samples("train")
-    lesson = UMesh(channels=3, levels=1).lesson(sparse, samples, samples)
+    objective = UMesh(channels=3, levels=1).objective(sparse, samples, samples)
     positions, shape = lattice(sparse.body)
     assert len(positions) < 0.9 * np.prod(shape)
     added: list[torch.Tensor] = []
-    lesson.network.leave.register_forward_hook(lambda module, inputs, values: values + added[0] if added else values)
+    objective.network.leave.register_forward_hook(lambda module, inputs, values: values + added[0] if added else values)
     batch = torch.arange(4)
-    plain = lesson.loss(batch).detach()
+    plain = objective.loss(batch).detach()
     padded = [size + size % 2 for size in shape]
     field = torch.zeros(4, 3, *padded, requires_grad=True)
     added.append(field)
-    (slope,) = torch.autograd.grad(lesson.loss(batch), field)
+    (slope,) = torch.autograd.grad(objective.loss(batch), field)
     occupied = torch.zeros(padded, dtype=torch.bool)
     occupied[tuple(torch.from_numpy(positions).T)] = True
     assert bool((slope[..., ~occupied] == 0.0).all()) and bool((slope[..., occupied] != 0.0).all())
     added[0] = torch.where(occupied, 0.0, 1e3).expand_as(field)
-    assert torch.equal(lesson.loss(batch).detach(), plain)
+    assert torch.equal(objective.loss(batch).detach(), plain)
 
 
 def test_a_body_on_a_sparse_grid_is_learned_and_predicted(sparse: DataSet, tmp_path: Path) -> None:

@@ -1,0 +1,122 @@
+"""Parameters to estimate beside the forces of a twin, and known loads that act on it, from the configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.export import Coordinates
+from softtwin.reference.data.loading import Loading
+from softtwin.registration.contact import Patch
+from softtwin.registration.parameter_blocks import ParameterBlocks
+
+from .config import Config
+from .parameters import NamedParameter, ParameterError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What is unknown beside the forces of a twin, and what is known to act along.
+
+    Args:
+        parameters: to estimate beside the forces.
+        forces: file of known nodal forces, .npy (n, 3), newtons, on the axes of the twin's files; None for none.
+        gravity: on the axes of the twin's files, (3,), m/s^2.
+        pressure: on the whole boundary, pascals.
+        density: kg/m^3.
+    """
+
+    parameters: tuple[NamedParameter, ...]
+    forces: Path | None
+    gravity: tuple[float, float, float]
+    pressure: float
+    density: float
+
+    @classmethod
+    def of(cls, config: Config) -> Scenario:
+        """What a configuration says."""
+        section = config.registration
+        return cls(
+            tuple(map(NamedParameter.parse, section.parameters)),
+            Path(section.known_forces) if section.known_forces else None,
+            section.gravity,
+            section.pressure,
+            config.material.density,
+        )
+
+    @property
+    def patch(self) -> Patch | None:
+        """The one contact of unknown place; None where forces act anywhere."""
+        contacts = [named for named in self.parameters if named.kind == "contact"]
+        if not contacts:
+            return None
+        return Patch() if contacts[0].number is None else Patch(contacts[0].number)
+
+    def modulus(self, modulus: float, body: Body) -> float | Floats:
+        """Young's modulus as the material needs it: one for each cell where that of a region is unknown, pascals."""
+        by_region = any(named.kind == "young-modulus" and named.place for named in self.parameters)
+        return np.full(len(body.cells), modulus) if by_region else modulus
+
+    @property
+    def held(self) -> dict[str, str]:
+        """Axes that are held at each node set."""
+        moved = [named.place for named in self.parameters if named.kind == "moved"]
+        return {"fixed": "xyz", **dict.fromkeys(moved, "xyz")}
+
+    def loading(self, body: Body, coordinates: Coordinates) -> Loading:
+        """What is known to act.
+
+        Args:
+            body: the body.
+            coordinates: of the twin's files.
+
+        Raises:
+            ParameterError: no such file, or forces of another body.
+        """
+        weight = coordinates.directions(np.array(self.gravity)) * self.density if any(self.gravity) else None
+        pressure = {"boundary": self.pressure} if self.pressure else {}
+        return Loading(self._known_forces(body, coordinates), weight, pressure=pressure)
+
+    def _known_forces(self, body: Body, coordinates: Coordinates) -> Floats | None:
+        if self.forces is None:
+            return None
+        try:
+            found = np.asarray(np.load(self.forces, allow_pickle=False), dtype=np.float64)
+        except (OSError, ValueError, EOFError) as error:
+            raise ParameterError(f"known forces: expected an array in {self.forces} ({error}).") from None
+        if found.shape != body.points.shape or not np.isfinite(found).all():
+            raise ParameterError(
+                f"known forces: expected finite numbers of shape {body.points.shape}, newtons, got shape {found.shape} "
+                f"in {self.forces}."
+            )
+        found = coordinates.directions(found)
+        lost = np.abs(found[body.fixed]).sum()
+        if lost > 1e-9 * np.abs(found).sum():
+            raise ParameterError(
+                f"known forces: expected none at fixed nodes, got {lost:.3g} N there in {self.forces}."
+            )
+        found[body.fixed] = 0.0
+        return found
+
+    def parameter_blocks(self, body: Body, modulus: float, ratio: float) -> ParameterBlocks | None:
+        """The parameters as registration takes them; None where there are none.
+
+        Args:
+            body: the body.
+            modulus: expected Young's modulus, pascals.
+            ratio: expected Poisson's ratio.
+
+        Raises:
+            ValueError: no such structure or node set, or each named twice.
+        """
+        named = [parameter for parameter in self.parameters if parameter.kind != "contact"]
+        if not named:
+            return None
+        values = {"young_modulus": self.modulus(modulus, body), "poisson_ratio": ratio}
+        return ParameterBlocks(body, values, tuple(parameter.condition(body) for parameter in named))

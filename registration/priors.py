@@ -1,0 +1,346 @@
+"""The unknowns of a registration, in blocks with priors: nodal forces through few directions, and the pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.spatial import cKDTree
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.embedding import outer_nodes
+
+from .forward import Discrepancy, ReducedModel
+from .hyperparameters import LogNormalPrior
+from .pose import Pose
+from .residuals import SurfaceDistance
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+_SMALLEST_VARIANCE = 1e-5  # of a pattern of forces, relative to the largest: rougher ones are left out
+_TANGENTIAL = 0.5  # weight of movements along the observed side: they become normal where it turns
+FORCE = LogNormalPrior(0.01, 2.0, minimum=1e-5)
+
+
+@dataclass(frozen=True, eq=False)
+class NodalForces:
+    """Nodal forces as a linear function of coefficients, independent and of one scale beforehand.
+
+    Args:
+        nodes: nodes that may carry force, (a,).
+        patterns: forces at these nodes for each coefficient, (3a, k), dimensionless: coefficients are in newtons.
+        count: number of nodes of the body, n.
+        scale: what is believed of the coefficients' standard deviation, newtons.
+        left_out: covariance of the net force of directions that were left out, for unit scale, (3, 3).
+        every: the patterns before any direction was left out, (3a, m); None where none was.
+        kept: orthonormal combinations of these that are left, (m, k); None as above.
+    """
+
+    nodes: Ints
+    patterns: Floats
+    count: int
+    scale: LogNormalPrior = FORCE
+    left_out: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+    every: Floats | None = None
+    kept: Floats | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients, k."""
+        return self.patterns.shape[1]
+
+    @cached_property
+    def basis(self) -> Floats:
+        """Forces at all nodes of the body for each coefficient, (3n, k)."""
+        return self._at_all(self.patterns)
+
+    def _at_all(self, patterns: Floats) -> Floats:
+        count = patterns.shape[1]
+        whole = np.zeros((self.count, 3, count))
+        whole[self.nodes] = patterns.reshape(len(self.nodes), 3, count)
+        return whole.reshape(3 * self.count, count)
+
+    @property
+    def unseen(self) -> Floats | None:
+        """Forces at all nodes of the directions that were left out, (3n, m), dimensionless; None where none was."""
+        if self.every is None or self.kept is None:
+            return None
+        return self._at_all(self.every - (self.every @ self.kept) @ self.kept.T)
+
+    def forces(self, coefficients: Floats) -> Floats:
+        """Nodal forces, (n, 3), newtons."""
+        whole = np.zeros((self.count, 3))
+        whole[self.nodes] = (self.patterns @ coefficients).reshape(len(self.nodes), 3)
+        return whole
+
+    def nearest(self, nodal: Floats) -> Floats:
+        """Coefficients, (k,), of the forces of this kind that are nearest to nodal ones, (n, 3), newtons."""
+        found: Floats = np.linalg.lstsq(self.patterns, nodal[self.nodes].ravel(), rcond=None)[0]
+        return found
+
+    def combined(self, kept: Floats) -> NodalForces:
+        """The forces in orthonormal combinations of their directions; the net force of the others is left in doubt.
+
+        Args:
+            kept: combinations, (k, kept).
+        """
+        rest = self.net_basis - (self.net_basis @ kept) @ kept.T
+        every = self.patterns if self.every is None else self.every
+        left = self.left_out + rest @ rest.T
+        both = kept if self.kept is None else self.kept @ kept
+        return replace(self, patterns=self.patterns @ kept, left_out=left, every=every, kept=both)
+
+    def leading(self, count: int) -> NodalForces:
+        """The first directions alone: those that move the observed side most, where they were reduced."""
+        kept = None if self.kept is None else self.kept[:, :count]
+        return replace(self, patterns=self.patterns[:, :count], kept=kept)
+
+    @cached_property
+    def net_basis(self) -> Floats:
+        """Net force of each coefficient, (3, k)."""
+        return _net(self.patterns)
+
+
+def _net(patterns: Floats) -> Floats:
+    summed: Floats = patterns.reshape(len(patterns) // 3, 3, patterns.shape[1]).sum(axis=0)
+    return summed
+
+
+def nodal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, smoothness: float = 0.0) -> NodalForces:
+    """Three force components at every node of a zone.
+
+    With a smoothness length s, the forces of two nodes at distance d correlate by exp(-d^2 / 2 s^2), so that a smooth
+    pull is cheaper than a scattered one.
+
+    Args:
+        body: the body.
+        nodes: nodes that may carry force; fixed and inner ones are left out.
+        scale: expected size of a nodal force component, newtons, and how well it is known.
+        smoothness: correlation length, metres; 0 for independent nodes (the L2 penalty of Odot 2023, eq. 6.5, squared).
+
+    Raises:
+        ValueError: no node is left, or a smoothness that is negative.
+    """
+    if not 0.0 <= smoothness < np.inf:
+        raise ValueError(f"nodal_forces.smoothness: expected a length of 0 m or more, got {smoothness}.")
+    chosen = np.setdiff1d(np.intersect1d(np.asarray(nodes, dtype=np.int64), outer_nodes(body)), body.fixed)
+    if len(chosen) == 0:
+        raise ValueError(
+            f"nodal_forces.nodes: expected nodes on the free boundary, none of the {np.size(nodes)} given is; "
+            "give the zone that the tool may touch."
+        )
+    root = _correlation_root(body.points[chosen], smoothness)
+    return NodalForces(chosen, np.kron(root, np.eye(3)), len(body.points), scale)
+
+
+def known_forces(body: Body, scale: LogNormalPrior = FORCE) -> NodalForces:
+    """No unknown force: all that acts is the model's own loading.
+
+    Args:
+        body: the body.
+        scale: without effect.
+    """
+    return NodalForces(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), len(body.points), scale)
+
+
+def _correlation_root(positions: Floats, smoothness: float) -> Floats:
+    """Independent patterns of nodal forces, (a, m), whose covariance is the correlation; few where it is smooth."""
+    if smoothness <= 0.0:
+        return np.eye(len(positions))
+    squared = ((positions[:, None] - positions[None]) ** 2).sum(axis=2)
+    correlation = np.exp(-squared / (2.0 * smoothness**2))
+    variances, modes = np.linalg.eigh(correlation)
+    kept = variances > _SMALLEST_VARIANCE * variances[-1]
+    return modes[:, kept] * np.sqrt(variances[kept])
+
+
+@dataclass(frozen=True)
+class LikelihoodInformed:
+    """Which directions of force a cloud can tell: those that move the observed side by more than the noise.
+
+    Args:
+        noise: least noise of a point expected, metres.
+        points: number of points of a cloud expected.
+        scale: largest scale of the coefficients expected, newtons.
+        information: directions whose expected information, in units of the prior's, is below this are left out.
+        maximum: most directions kept.
+    """
+
+    noise: float = 1e-4
+    points: int = 500
+    scale: float = 0.03
+    information: float = 0.5
+    maximum: int = 96
+
+
+def likelihood_informed(model: ReducedModel, observed: SurfaceDistance, rule: LikelihoodInformed) -> Floats:
+    """Orthonormal combinations of a force basis that a cloud can tell at rest, (k, kept), those told best first.
+
+    They are the leading eigenvectors of the prior-whitened Gauss-Newton matrix at rest: the likelihood-informed
+    subspace (Spantini et al. 2015).
+
+    Args:
+        model: between the coefficients of the basis and the observed nodes.
+        observed: the observed side.
+        rule: what is told from what.
+    """
+    moved = model.solve(np.zeros(model.count)).jacobian(_observing_rows(observed))
+    squares, vectors = np.linalg.eigh(moved.T @ moved)
+    information = squares[::-1] * (rule.scale / rule.noise) ** 2 * rule.points
+    count = min(rule.maximum, max(int((information > rule.information).sum()), 1))
+    return np.ascontiguousarray(vectors[:, ::-1][:, :count])
+
+
+def localised(forces: NodalForces, where: Floats) -> NodalForces:
+    """The forces where they may act: each node's share of the basis times its part.
+
+    Args:
+        forces: forces of which nothing is known of their place.
+        where: part of its expected size that a force at each node may have, (n,).
+    """
+    parts = np.repeat(where[forces.nodes], 3)
+    patterns = parts[:, None] * forces.patterns
+    every = forces.patterns if forces.every is None else forces.every
+    whole, kept = _parted_net(parts, every), _net(patterns)
+    return replace(forces, patterns=patterns, left_out=whole @ whole.T - kept @ kept.T, every=None, kept=None)
+
+
+def _parted_net(parts: Floats, patterns: Floats) -> Floats:
+    """Net force of each pattern times its nodes' parts, (3, k), with no copy of the patterns."""
+    axes = np.zeros((3, len(parts)))
+    for axis in range(3):
+        axes[axis, axis::3] = parts[axis::3]
+    return axes @ patterns
+
+
+def contact(forces: NodalForces, nodal: Floats, positions: Floats, reach: float, minimum: float = 0.02) -> Floats:
+    """Where forces were found, as parts of the largest, (n,): the next prior of forces whose place is unknown.
+
+    Repeated, forces gather where the cloud asks for them (re-weighted least squares: Gorodnitsky and Rao 1997).
+
+    Args:
+        forces: the unknown forces.
+        nodal: forces found, (n, 3), newtons.
+        positions: of the nodes at rest, (n, 3), metres.
+        reach: forces within this distance count together, metres.
+        minimum: no part is smaller: a force elsewhere stays possible.
+    """
+    place = positions[forces.nodes]
+    size = np.linalg.norm(nodal[forces.nodes], axis=1)
+    near = cKDTree(place).sparse_distance_matrix(cKDTree(place), 3.0 * reach, output_type="coo_matrix")
+    smooth = coo_array((np.exp(-0.5 * (near.data / reach) ** 2), (near.row, near.col)), shape=near.shape) @ size
+    where = np.zeros(len(positions))
+    where[forces.nodes] = np.maximum(smooth / max(smooth.max(), 1e-300), minimum)
+    return where
+
+
+def _observing_rows(observed: SurfaceDistance) -> csr_array:
+    """Root mean square movement of the observed side as rows, (3v, 3m): along the normal, and less across it."""
+    normals, share = observed.normals
+    count = len(normals)
+    blocks = _TANGENTIAL * np.eye(3) + (1.0 - _TANGENTIAL) * normals[:, :, None] * normals[:, None, :]
+    blocks *= np.sqrt(share)[:, None, None]
+    columns = np.repeat((3 * np.arange(count)[:, None] + np.arange(3))[:, None, :], 3, axis=1)
+    indptr = np.arange(0, 9 * count + 1, 3)
+    return observed.by_nodes(csr_array((blocks.ravel(), columns.ravel(), indptr), shape=(3 * count, 3 * count)))
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """An unknown pose near an expected one.
+
+    Args:
+        mean: the pose expected.
+        centre: of the turn, in the body's coordinates, (3,), metres.
+        rotation_deviation: standard deviation of the turn about each axis, radians.
+        translation_deviation: standard deviation of the shift along each axis, metres.
+        is_said: the expected pose is the one that results are told in: what is found beside it counts as displacement.
+    """
+
+    mean: Pose
+    centre: Floats
+    rotation_deviation: float = np.deg2rad(5.0)
+    translation_deviation: float = 0.01
+    is_said: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("rotation_deviation", "translation_deviation"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f"PosePrior.{name}: expected a positive deviation, got {getattr(self, name)}.")
+
+    @property
+    def deviations(self) -> Floats:
+        """Of turn and shift, (6,)."""
+        return np.repeat([self.rotation_deviation, self.translation_deviation], 3)
+
+    def pose(self, coefficients: Floats) -> Pose:
+        """The pose for coefficients of unit variance, (6,)."""
+        return self.mean.moved(self.deviations * coefficients, self._pivot)
+
+    def jacobian(self, coefficients: Floats, points: Floats) -> Floats:
+        """Derivative of where the camera sees points by the coefficients, (p, 3, 6), metres, on the camera's axes.
+
+        Args:
+            coefficients: of unit variance, (6,).
+            points: in the body's coordinates, (p, 3), metres.
+        """
+        moved = self.mean.moved_jacobian(points, self.deviations * coefficients, self._pivot)
+        return moved.reshape(-1, 3, 6) * self.deviations
+
+    @property
+    def _pivot(self) -> Floats:
+        """The centre of the turn where the expected pose puts it, (3,)."""
+        return self.mean.apply(self.centre[None])[0]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelError:
+    """What the forward model may get wrong, as unknowns of unit variance (Kennedy and O'Hagan 2001).
+
+    Args:
+        discrepancy: of the model, for a largest displacement of one metre.
+        observed: rows of its modes at the observed nodes, (3p, m).
+        left_out: its rest there, (p,).
+        size: largest displacement that is reckoned with, metres.
+    """
+
+    discrepancy: Discrepancy
+    observed: Floats
+    left_out: Floats
+    size: float
+
+    @classmethod
+    def of(cls, discrepancy: Discrepancy, nodes: Ints) -> ModelError:
+        """For a largest displacement of one metre.
+
+        Args:
+            discrepancy: of the model.
+            nodes: numbers of the observed nodes, (p,).
+        """
+        rows = (3 * nodes[:, None] + np.arange(3)).ravel()
+        return cls(discrepancy, np.ascontiguousarray(discrepancy.modes[rows]), discrepancy.rest[nodes], 1.0)
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
+        return self.observed.shape[1]
+
+    @cached_property
+    def rest(self) -> Floats:
+        """Standard deviation of an observed node's distance by what the modes leave out, (p,), metres."""
+        return self.size * self.left_out
+
+    def jacobian(self, rows: csr_array | Floats) -> Floats:
+        """Derivative of linear functions of the observed nodes' displacement, (q, m), for rows (q, 3p)."""
+        return self.size * (rows @ self.observed)
+
+    def field(self, coefficients: Floats) -> Floats:
+        """What is to be added to the model's displacement, (n, 3), metres."""
+        return (self.discrepancy.modes @ (self.size * coefficients)).reshape(-1, 3)
+
+    def observed_field(self, coefficients: Floats, every: int = 1) -> Floats:
+        """The same at the observed nodes alone, one of so many, (p, 3)."""
+        return self.observed.reshape(-1, 3, self.count)[::every] @ (self.size * coefficients)

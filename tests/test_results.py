@@ -1,0 +1,42 @@
+"""The pages of results hold what the records say, and no more rows than a person reads."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+dashboard = pytest.importorskip("dashboard", reason="benchmarks is not on the path")
+
+PAGES = Path(__file__).resolve().parents[1] / "docs" / "results"
+
+
+@pytest.mark.parametrize("stem", ["index", *dashboard.CHAPTERS])
+def test_a_page_shows_its_records(stem: str) -> None:
+    page = (PAGES / f"{stem}.md").read_text()
+    assert dashboard.placed(page, dashboard.tables()[stem]) == page, "run `python benchmarks/dashboard.py`"
+
+
+@pytest.mark.parametrize("stem", ["index", *dashboard.CHAPTERS])
+def test_a_page_is_no_longer_than_it_may_be(stem: str) -> None:
+    rows = [line for line in (PAGES / f"{stem}.md").read_text().splitlines() if re.match(r"\|(?!---)", line)]
+    assert 3 < len(rows) - 1 <= dashboard.MOST_ROWS["index" if stem == "index" else "chapter"]
+
+
+def test_a_figure_that_misses_what_was_asked_for_is_marked() -> None:
+    short = [row for row in dashboard.ROWS if row.is_short]
+    assert short and all("(**short**)" in dashboard.table([row]) for row in short)
+    assert "(**short**)" not in dashboard.table([row for row in dashboard.ROWS if not row.is_short])
+
+
+def test_a_changed_record_changes_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check itself: another figure in the record, and the page is not its any more."""
+    page = (PAGES / "live.md").read_text()
+    changed = {
+        **dashboard.load("stream"),
+        "figures": {**dashboard.load("stream")["figures"], "age_ms": {"p50": 9, "p999": 9}},
+    }
+    load = dashboard.load
+    monkeypatch.setattr(dashboard, "load", lambda name: changed if name == "stream" else load(name))
+    assert dashboard.placed(page, dashboard.tables()["live"]) != page
