@@ -104,7 +104,7 @@ def made(row: Row) -> str:
             told |= {name: one[name] for name in told if name in one}
             own = one.get("made")
             told |= {name: own[name] for name in told if isinstance(own, dict) and name in own}
-    commit = told["commit"] or "before records had one"
+    commit = told["commit"] or "no commit"
     return f"{commit}, {told['date']}"
 
 
