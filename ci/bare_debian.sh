@@ -62,11 +62,11 @@ if [ ${#WANTED[@]} != 0 ]; then
     inside apt-get -q install -y --no-install-recommends "${WANTED[@]}"
 fi
 
-rm -rf "$TREE/work" && mkdir -p "$TREE/work"
-git clone -q --no-hardlinks "$ROOT" "$TREE/work/softtwin"
-if [ -d ../shared ]; then cp -r ../shared "$TREE/work/shared"; fi
+rm -rf "$TREE/src" && mkdir -p "$TREE/src"
+git clone -q --no-hardlinks "$ROOT" "$TREE/src/softtwin"
+if [ -d ../shared ]; then cp -r ../shared "$TREE/src/shared"; fi
 began=$(date +%s)
 status=0
-inside bash -c 'cd /work/softtwin && exec "$@"' bash "$@" || status=$?
+inside bash -c 'cd /src/softtwin && exec "$@"' bash "$@" || status=$?
 say "Debian $RELEASE by $WAY${WITH:+ with $WITH}: '$*' ended with $status after $(($(date +%s) - began)) s"
 exit $status

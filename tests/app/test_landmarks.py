@@ -134,7 +134,7 @@ def test_what_are_no_landmarks_of_the_clouds_is_said_before_the_first(plain_twin
     with pytest.raises(FileError, match=r"expected landmarks that the body has \(m0, .*\), got tip"):
         MarkFiles.read(body, other, METRES, METRES, clouds[:1])
     with pytest.raises(
-        ConfigError, match=r"--frame-landmarks: .*expected points on the observed side at rest; point 0 lies"
+        ConfigError, match=r"--frame-landmarks: .*expected points on the observed surface; point 0 lies"
     ):
         MarkFiles({"far": np.ones(3)}, other, METRES).check(plain_twin)
 

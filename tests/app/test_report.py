@@ -173,7 +173,7 @@ def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[s
             state = SimpleNamespace(displacement=shape)
             result = Registration(
                 prepared=None,  # type: ignore[arg-type]
-                trial=None,  # type: ignore[arg-type]
+                evaluation=None,  # type: ignore[arg-type]
                 forces=np.full_like(shape, 0.01),
                 state=state,  # type: ignore[arg-type]
                 correction=np.zeros_like(shape),

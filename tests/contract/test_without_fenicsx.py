@@ -50,7 +50,7 @@ with Twin.open(PHANTOM) as twin:
     ends = [[twin.predict(forces + sign * size * change).displacement for sign in (1.0, -1.0)] for size in (0.1, 0.05)]
     slopes = [(up - down).ravel() / (2.0 * size) for (up, down), size in zip(ends, (0.1, 0.05))]
     cotangent = np.random.default_rng(1).standard_normal(forces.shape)
-    along = float(np.vdot(state.pull(cotangent), change))
+    along = float(np.vdot(state.vjp(cotangent), change))
     off = [abs(float(cotangent.ravel() @ slope) - along) for slope in slopes]
     print(json.dumps({
         "rest": float(np.abs(rest.displacement).max()), "moved": float(np.abs(state.displacement).max()),

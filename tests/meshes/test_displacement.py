@@ -166,7 +166,7 @@ def test_what_cannot_be_is_said_by_name(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"displacement: expected shape \(\d+, 3\), got \(4, 3\)"):
         forward_field(body, np.zeros((4, 3)))
     for spacing in (1e-7, -1.0, np.nan):
-        with pytest.raises(ValueError, match="spacing: expected an edge in metres of at least"):
+        with pytest.raises(ValueError, match="spacing: expected an edge of at least"):
             inverse_field(body, bent(body), spacing)
     with pytest.raises(FileError, match=r"field\.nii: expected the suffix \.nrrd"):
         write_displacement(tmp_path / "field.nii", field, Coordinates("mm"))

@@ -121,7 +121,7 @@ def several(body: Body) -> dict[str, tuple[dict, tuple]]:
     return {
         "expected a positive deviation": (whole, lambda: (YoungModulus(0.0),)),
         "needs poisson_ratio": (whole, lambda: (PoissonRatio(),)),
-        r"expected a Poisson's ratio within \]0.2, 0.5\[": ({"poisson_ratio": 0.1}, lambda: (PoissonRatio(),)),
+        r"expected Poisson's ratio in \]0.2, 0.5\[": ({"poisson_ratio": 0.1}, lambda: (PoissonRatio(),)),
         "expected a Young's modulus above 10 Pa": ({"young_modulus": 9.0}, lambda: (YoungModulus(),)),
         "at least one of the body's": (whole, lambda: (YoungModulus(1.0, np.zeros(0, dtype=np.int64)),)),
         "one Young's modulus for each cell": (whole, lambda: (YoungModulus(1.0, np.array([0])),)),

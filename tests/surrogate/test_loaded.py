@@ -56,5 +56,5 @@ def test_forces_where_it_has_never_seen_any_are_refused(reduced: Surrogate) -> N
     )
     inside = np.zeros_like(reduced.body.points)
     inside[idle[0]] = [0.0, 0.0, 1.0]
-    with pytest.raises(ValueError, match="nodes that carried load in training"):
+    with pytest.raises(ValueError, match="nodes loaded in training"):
         LoadedSurrogate(reduced, inside)

@@ -173,7 +173,7 @@ def test_forces_where_none_were_trained_are_refused_by_name(surrogate: Surrogate
     inside = int(np.setdiff1d(surrogate.body.free, surrogate.encoder_decoder.loaded)[0])
     bad = np.zeros_like(surrogate.body.points)
     bad[inside, 1] = 1e-9
-    with pytest.raises(ValueError, match=rf"1 other nodes, first \[{inside}\]"):
+    with pytest.raises(ValueError, match=rf"1 others, first \[{inside}\]"):
         surrogate.solve(bad)
     with pytest.raises(ValueError, match=rf"basis.*first \[{inside}\]"):
         surrogate.reduced([0], bad.reshape(-1, 1))
