@@ -243,17 +243,17 @@ def _mpirun() -> Check:
     return Check("mpirun", "ok", f"{found.path}, {found.vendor}")
 
 
-def loaded_blas(maps: str) -> dict[str, str]:
+def loaded_blas(memory_map: str) -> dict[str, str]:
     """The BLAS libraries that a process has loaded, and who brought each.
 
     Args:
-        maps: text of /proc/PID/maps.
+        memory_map: text of /proc/PID/maps.
 
     Returns:
         Path of each library: the kind of BLAS. Those that a wheel of numpy, scipy or torch has for itself are left
         out, for PETSc and MUMPS do not call them.
     """
-    paths = {match.group(0) for match in re.finditer(r"/\S*lib\S*(?:blas|blis|mkl_rt|atlas)\S*\.so\S*", maps)}
+    paths = {match.group(0) for match in re.finditer(r"/\S*lib\S*(?:blas|blis|mkl_rt|atlas)\S*\.so\S*", memory_map)}
     shared = (path for path in sorted(paths) if not re.search(r"/(numpy|scipy|torch)(\.libs)?/", path))
     return {path: kind for path in shared if (kind := _blas_kind(path))}
 

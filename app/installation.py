@@ -125,14 +125,14 @@ def launcher() -> Launcher | None:
     found = str(beside) if beside.exists() else shutil.which("mpirun")
     if found is None:
         return None
-    told = subprocess.run([found, "--version"], capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S).stdout
-    return Launcher(Path(found), launcher_vendor(told))
+    output = subprocess.run([found, "--version"], capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S).stdout
+    return Launcher(Path(found), launcher_vendor(output))
 
 
-def launcher_vendor(told: str) -> str:
+def launcher_vendor(output: str) -> str:
     """Whose `mpirun` it is, from what `mpirun --version` printed: named as mpi4py names it."""
-    if "Open MPI" in told or "OpenRTE" in told:
+    if "Open MPI" in output or "OpenRTE" in output:
         return "Open MPI"
-    if "HYDRA" in told:
-        return "Intel MPI" if "Intel" in told else "MPICH"
-    return (told.strip().splitlines() or ["an unknown MPI"])[0]
+    if "HYDRA" in output:
+        return "Intel MPI" if "Intel" in output else "MPICH"
+    return (output.strip().splitlines() or ["an unknown MPI"])[0]

@@ -46,7 +46,7 @@ def describe_landmarks(fit: LandmarkFit) -> str:
 
 
 @dataclass(frozen=True)
-class MarkFiles:
+class LandmarkFiles:
     """Points of the organ by name, and the files that say where each frame shows some of them.
 
     The file of a frame is named like its cloud, but for the suffix; a frame without one has its cloud alone.
@@ -64,7 +64,7 @@ class MarkFiles:
     @classmethod
     def read(
         cls, body: Path, camera: Path, inside: Coordinates, clouds: Coordinates, files: Sequence[Path] | None
-    ) -> MarkFiles:
+    ) -> LandmarkFiles:
         """The landmarks of the body; those of each cloud that is there already are read once, too.
 
         Args:

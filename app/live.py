@@ -15,7 +15,7 @@ from .address import Address
 from .answer import Answer, Reply
 from .config import ConfigError
 from .export import WRITTEN, Exporter
-from .landmarks import MarkFiles
+from .landmarks import LandmarkFiles
 from .record import Recorder, counts, describe
 from .register import Scene, Start, check_any, check_budget, name_of, registered, say_coordinates
 from .sources import check_idle, opened
@@ -28,7 +28,7 @@ def answers(
     box: Mailbox,
     budget: float | None = None,
     clock: Clock = time.monotonic,
-    marks: MarkFiles | None = None,
+    frame_landmarks: LandmarkFiles | None = None,
 ) -> Iterator[Answer]:
     """The newest cloud registered, again and again, until the mailbox is closed.
 
@@ -38,7 +38,7 @@ def answers(
         budget: seconds from a cloud's coming to its answer: no step is begun after it, and the answer is the best so
             far; no limit if not given. One step of the reference can take longer than all of it.
         clock: seconds of the monotonic clock that the mailbox has, too.
-        marks: landmarks that pull beside clouds in files.
+        frame_landmarks: landmarks that pull beside clouds in files.
 
     Raises:
         ConfigError: a budget that is no positive number.
@@ -46,7 +46,7 @@ def answers(
     check_budget(budget)
     while (arrival := box.take()) is not None:
         until = np.inf if budget is None else arrival.at + budget
-        frame = registered(sequence, arrival.cloud, until, marks)
+        frame = registered(sequence, arrival.cloud, until, frame_landmarks)
         age = clock() - arrival.at
         name = arrival.name or name_of(arrival.cloud)
         yield Answer(frame, name, age, arrival.dropped, budget is not None and age > budget)
@@ -61,7 +61,7 @@ def register_live(
     camera: Camera = None,
     formats: tuple[str, ...] = WRITTEN,
     budget: float | None = None,
-    marks: MarkFiles | None = None,
+    frame_landmarks: LandmarkFiles | None = None,
     reply: Reply | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
@@ -75,7 +75,7 @@ def register_live(
         camera: where the camera stands.
         formats: of the files of each frame; none are written for `()`, which is the quickest.
         budget: as for `answers`.
-        marks: landmarks that pull beside clouds in files.
+        frame_landmarks: landmarks that pull beside clouds in files.
         reply: is given each answer and its figures before files are written.
         say: prints one line a frame.
 
@@ -84,10 +84,10 @@ def register_live(
         ConfigError: a budget that is no positive number; landmarks that this twin cannot take.
     """
     sequence = Sequence(twin, zone, camera)
-    if marks is not None:
-        marks.check(twin)
+    if frame_landmarks is not None:
+        frame_landmarks.check(twin)
     with Recorder(Exporter(twin, output, formats), zone) as recorder:
-        for answer in answers(sequence, box, budget, marks=marks):
+        for answer in answers(sequence, box, budget, frame_landmarks=frame_landmarks):
             figures = {"age_s": answer.age, "dropped": answer.dropped, "is_late": answer.is_late}
             row = recorder.figures(answer.frame, answer.cloud, **figures)
             if reply is not None:
@@ -151,20 +151,20 @@ def watch_source(
     scene = Scene.of(place, options, unit, axes)
     budget = scene.budget(budget)
     start = start or Start()
-    marks = scene.marks(start)
-    if marks is not None and isinstance(source, Address):
+    frame_landmarks = scene.frame_landmarks(start)
+    if frame_landmarks is not None and isinstance(source, Address):
         raise ConfigError(
-            f"--frame-landmarks: expected clouds in files, which marks go with by their names, got {source}."
+            f"--frame-landmarks: expected clouds in files, which landmarks go with by their names, got {source}."
         )
     with scene.opened(start, say) as (twin, camera):
         say_coordinates(twin, say)
         twin.registrar()  # prepared before the first cloud is waited for
         with opened(source, scene, twin, idle, say) as feed:
             rows = register_live(
-                twin, feed.box, output, camera=camera, formats=formats or WRITTEN, budget=budget, marks=marks,
-                reply=feed.reply, say=say,
+                twin, feed.box, output, camera=camera, formats=formats or WRITTEN, budget=budget,
+                frame_landmarks=frame_landmarks, reply=feed.reply, say=say,
             )  # fmt: skip
             say(keeping_up(rows))
-            if told := feed.told():
+            if told := feed.summary():
                 say(told)
     return counts(rows)

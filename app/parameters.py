@@ -58,7 +58,7 @@ class NamedParameter:
             raise ParameterError(f"expected {'moved@NODES' if kind == 'moved' else kind}, got {text!r}")
         return cls(kind, found["place"] or "", _positive(found["number"], text))
 
-    def condition(self, body: Body) -> ParameterBlock:
+    def parameter_block(self, body: Body) -> ParameterBlock:
         """What it is to a registration.
 
         Args:

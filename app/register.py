@@ -27,7 +27,7 @@ from . import twin as twins
 from .arguments import RegisterArguments
 from .config import ConfigError
 from .export import WRITTEN, Exporter
-from .landmarks import MarkFiles, camera_from_landmarks, describe_landmarks
+from .landmarks import LandmarkFiles, camera_from_landmarks, describe_landmarks
 from .parameters import priors_taken
 from .record import NOTICE as NOTICE
 from .record import Recorder, counts, describe, notes_on
@@ -167,14 +167,14 @@ class Start:
         matrix: file of the pose.
         landmarks: files of landmarks, on the body and in the camera's coordinates.
         align: look for the pose in the clouds.
-        marks: file of points on the body at rest, and the folder of where each cloud's frame shows them (or the file,
-            for one cloud); see `MarkFiles`.
+        frame_landmarks: file of points on the body at rest, and the folder of where each cloud's frame shows
+            them (or the file, for one cloud); see `LandmarkFiles`.
     """
 
     matrix: Path | None = None
     landmarks: tuple[Path, Path] | None = None
     align: bool = False
-    marks: tuple[Path, Path] | None = None
+    frame_landmarks: tuple[Path, Path] | None = None
 
 
 def register_files(
@@ -214,12 +214,20 @@ def register_files(
     budget = scene.budget(budget)
     positions = None if truth is None else read_truth(truth, len(clouds), scene.home.body, scene.inside)
     start = start or Start()
-    marks = scene.marks(start, [cloud.path for cloud in clouds])
+    frame_landmarks = scene.frame_landmarks(start, [cloud.path for cloud in clouds])
     with scene.opened(start, say) as (twin, camera):
         say_coordinates(twin, say)
         chosen = formats or WRITTEN
         rows = register_clouds(
-            twin, clouds, output, camera=camera, truth=positions, formats=chosen, budget=budget, marks=marks, say=say
+            twin,
+            clouds,
+            output,
+            camera=camera,
+            truth=positions,
+            formats=chosen,
+            budget=budget,
+            frame_landmarks=frame_landmarks,
+            say=say,
         )
     return counts(rows)
 
@@ -268,7 +276,7 @@ class Scene:
             return given
         return twins.with_options(self.home.config, dict(self.options)).registration.budget or None
 
-    def marks(self, start: Start, clouds: Sequence[Path] | None = None) -> MarkFiles | None:
+    def frame_landmarks(self, start: Start, clouds: Sequence[Path] | None = None) -> LandmarkFiles | None:
         """What pulls beside the clouds; None where nothing was given.
 
         Args:
@@ -276,9 +284,13 @@ class Scene:
             clouds: files of all clouds; None where they are yet to come.
 
         Raises:
-            ConfigError, FileError: see `MarkFiles.read`.
+            ConfigError, FileError: see `LandmarkFiles.read`.
         """
-        return None if start.marks is None else MarkFiles.read(*start.marks, self.inside, self.outside, clouds)
+        return (
+            None
+            if start.frame_landmarks is None
+            else LandmarkFiles.read(*start.frame_landmarks, self.inside, self.outside, clouds)
+        )
 
     @contextmanager
     def opened(self, start: Start, say: Callable[[str], None]) -> Iterator[tuple[Twin, Camera]]:
@@ -335,7 +347,7 @@ def register_clouds(
     truth: Floats | None = None,
     formats: tuple[str, ...] = WRITTEN,
     budget: float | None = None,
-    marks: MarkFiles | None = None,
+    frame_landmarks: LandmarkFiles | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
     """Register a sequence and write each frame as it is found; returns the figures of all frames.
@@ -349,7 +361,7 @@ def register_clouds(
         truth: true node positions of each frame, (frames, n, 3), metres, to state errors.
         formats: of the files of each frame.
         budget: as for `register_files`.
-        marks: landmarks that pull beside clouds in files.
+        frame_landmarks: landmarks that pull beside clouds in files.
         say: prints one line a frame.
 
     Raises:
@@ -358,15 +370,15 @@ def register_clouds(
     """
     check_budget(budget)
     sequence = twins.Sequence(twin, zone, camera)
-    if marks is not None:
-        marks.check(twin)
+    if frame_landmarks is not None:
+        frame_landmarks.check(twin)
     with (
         Recorder(Exporter(twin, output, formats), zone, truth) as recorder,
         tqdm(total=len(clouds), desc="registering", unit="frame", disable=None) as bar,
     ):
         for cloud in clouds:
             until = math.inf if budget is None else time.monotonic() + budget
-            row = recorder.add(registered(sequence, cloud, until, marks), name_of(cloud))
+            row = recorder.add(registered(sequence, cloud, until, frame_landmarks), name_of(cloud))
             with tqdm.external_write_mode():
                 say(describe(row))
             bar.update()
@@ -406,7 +418,7 @@ def registered(
     sequence: twins.Sequence,
     cloud: CloudFile | ArrayLike,
     until: float = math.inf,
-    marks: MarkFiles | None = None,
+    frame_landmarks: LandmarkFiles | None = None,
 ) -> Frame:
     """The next frame of a sequence; refused, with the reason, where its file or its landmarks' cannot be read.
 
@@ -414,13 +426,13 @@ def registered(
         sequence: the sequence.
         cloud: a file, or points (p, 3) in metres.
         until: as for `Sequence.register`.
-        marks: landmarks that pull beside clouds in files.
+        frame_landmarks: landmarks that pull beside clouds in files.
     """
     if not isinstance(cloud, CloudFile):
         return sequence.register(cloud, until)
     try:
         points = cloud.read()
-        landmarks = None if marks is None else marks.of(cloud.path)
+        landmarks = None if frame_landmarks is None else frame_landmarks.of(cloud.path)
     except FileError as error:  # it could be read a moment ago, or holds nothing to register
         return sequence.refuse(str(error).removeprefix(f"{cloud.path}: "))  # the frame says which file it is
     return sequence.register(points, until, landmarks)

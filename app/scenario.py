@@ -119,4 +119,4 @@ class Scenario:
         if not named:
             return None
         values = {"young_modulus": self.modulus(modulus, body), "poisson_ratio": ratio}
-        return ParameterBlocks(body, values, tuple(parameter.condition(body) for parameter in named))
+        return ParameterBlocks(body, values, tuple(parameter.parameter_block(body) for parameter in named))

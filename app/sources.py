@@ -34,12 +34,12 @@ class Feed:
     Args:
         box: where they come.
         reply: is given each answer; None where nobody listens.
-        told: one line for a person about what came and went; empty where there is nothing to say.
+        summary: one line for a person about what came and went; empty where there is nothing to say.
     """
 
     box: Mailbox
     reply: Reply | None = None
-    told: Callable[[], str] = lambda: ""
+    summary: Callable[[], str] = lambda: ""
 
 
 def watched(folder: Path, scene: Scene, idle: float | None, say: Callable[[str], None]) -> WatchedFolder:
@@ -93,7 +93,7 @@ def opened(
             if link.peers:
                 link.send(speaker.messages(answer, link.counts, row))
 
-        def told() -> str:
+        def summary() -> str:
             return "OpenIGTLink: " + ", ".join(f"{count} {name}" for name, count in link.counts.items())
 
-        yield Feed(box, reply, told)
+        yield Feed(box, reply, summary)

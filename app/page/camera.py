@@ -32,19 +32,19 @@ class View:
     Args:
         noise: standard deviation of a point, metres.
         share: of the visible side that is seen, in (0, 1].
-        turn: of the camera about the vertical axis, radians.
-        shift: of the camera sideways, metres.
+        rotation: of the camera about the vertical axis, radians.
+        translation: of the camera sideways, metres.
     """
 
     noise: float = 5e-4
     share: float = 1.0
-    turn: float = 0.0
-    shift: float = 0.0
+    rotation: float = 0.0
+    translation: float = 0.0
 
     @property
     def is_misaligned(self) -> bool:
         """Whether the camera's coordinates are not the body's, so that the pose is to be found."""
-        return bool(self.turn or self.shift)
+        return bool(self.rotation or self.translation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +116,9 @@ def shot(body: Body, states: TrueStates, angle: float, view: View, rng: np.rando
 
 def pose_of(view: View, body: Body) -> Pose:
     """The true pose: a turn about the vertical through the body's middle, then a shift sideways."""
-    centre, cosine, sine = body.points.mean(axis=0), np.cos(view.turn), np.sin(view.turn)
+    centre, cosine, sine = body.points.mean(axis=0), np.cos(view.rotation), np.sin(view.rotation)
     rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return Pose(rotation, centre - rotation @ centre + view.shift * _SIDEWAYS)
+    return Pose(rotation, centre - rotation @ centre + view.translation * _SIDEWAYS)
 
 
 def _part(cloud: Floats, share: float) -> Floats:

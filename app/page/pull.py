@@ -50,11 +50,11 @@ class Place:
     """Where the mouse is.
 
     Args:
-        shift: from where it took hold, (3,), metres.
+        translation: from where it took hold, (3,), metres.
         at: when, seconds of the monotonic clock.
     """
 
-    shift: Floats
+    translation: Floats
     at: float
 
 
@@ -73,7 +73,7 @@ class Pull:
         self._weights = patch(twin, held, displacement, _GRIP)
         state = twin.predict(forces)
         self._rest = self._weights @ state.displacement
-        self._basis = usual_loads(twin, held, displacement, _moved_by(state, self._weights))
+        self._basis = typical_loads(twin, held, displacement, _moved_by(state, self._weights))
         self._farthest = _FARTHEST * farthest(twin)
         self._limit = _WORTHLESS * twin.body.size
         self._amounts: Floats = np.zeros(3)
@@ -82,7 +82,7 @@ class Pull:
 
     def to(self, place: Place) -> Prediction:
         """The prediction for a place of the mouse; where it would be worth nothing, the last one, which is said."""
-        wanted = self._rest + _within(place.shift, self._farthest)
+        wanted = self._rest + _within(place.translation, self._farthest)
         for part in _PARTS if self._last is not None else (1.0,):
             before = self._amounts
             found = self._prediction(self._towards(self._reached + part * (wanted - self._reached)), place.at)
@@ -96,8 +96,8 @@ class Pull:
         return replace(self._last, is_held=self._is_held(place), asked=place.at)
 
     def _is_held(self, place: Place) -> bool:
-        left = np.linalg.norm(self._rest + place.shift - self._reached)
-        return bool(left > _LEFT * np.linalg.norm(place.shift) + _LEAST_LEFT)
+        left = np.linalg.norm(self._rest + place.translation - self._reached)
+        return bool(left > _LEFT * np.linalg.norm(place.translation) + _LEAST_LEFT)
 
     def _towards(self, wanted: Floats) -> Any:
         """The state under amounts by which the place is where it is wanted, or nearer to it."""
@@ -140,7 +140,7 @@ def judged(found: Prediction) -> tuple[Verdict, str]:
     return Verdict.DOUBTFUL, next(iter(error_bound.reasons), "nothing can be said of its error")
 
 
-def usual_loads(twin: Twin, held: Floats, displacement: Floats, response: Floats) -> Floats:
+def typical_loads(twin: Twin, held: Floats, displacement: Floats, response: Floats) -> Floats:
     """Three loads on the nodes about a place, (n, 3, 3), newtons: the most usual ones that move it along each axis.
 
     Usual is what the training loads were like on these nodes: of all loads that move the place by as much, these have

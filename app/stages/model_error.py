@@ -48,7 +48,7 @@ def model_error_stage(configuration: Path) -> str | None:
         return None
     space, data = asked
     section = space.config.model_error
-    alternatives = alternatives_of(space.config)
+    alternatives = ensemble_of(space.config)
     found = differences(space.data, alternatives, section.draws, section.seed, comm)
     assert found is not None
     if len(found.errors) < _MINIMUM_MODELS:
@@ -69,7 +69,7 @@ def model_error_stage(configuration: Path) -> str | None:
     return describe_model_error(found.errors, found.failed)
 
 
-def alternatives_of(config: Config) -> Any:
+def ensemble_of(config: Config) -> Any:
     """What [model_error] perturbs, as the reference takes it.
 
     Raises:
@@ -104,5 +104,5 @@ def _read(configuration: Path) -> tuple[Workspace, DataSet]:
     space = open_workspace(configuration)
     if not space.config.model_error.draws:
         raise ConfigError("model_error.draws: expected at least 1 to draw perturbed models, got 0.")
-    alternatives_of(space.config)
+    ensemble_of(space.config)
     return space, current_data(space)[0]

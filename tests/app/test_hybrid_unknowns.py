@@ -93,7 +93,7 @@ def test_known_forces_inside_are_none_of_the_networks(small_quickstart: Path, tm
     inside[np.setdiff1d(np.arange(len(body.points)), body.boundary_nodes)[0], 2] = 0.1
     np.save(tmp_path / "known.npy", inside)
     with (
-        pytest.raises(ConfigError, match=r"registration\.known_forces: .*carried load in training.*reference engine"),
+        pytest.raises(ConfigError, match=r"registration\.known_forces: .*loaded in training.*reference engine"),
         Twin.open(small_quickstart, "hybrid", known_forces=str(tmp_path / "known.npy")),
     ):
         raise AssertionError("not opened")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from softtwin.app.config import ConfigError
-from softtwin.app.landmarks import MarkFiles
+from softtwin.app.landmarks import LandmarkFiles
 from softtwin.app.live import register_live
 from softtwin.app.record import RECORD
 from softtwin.app.register import CloudFile, register_clouds
@@ -65,12 +65,20 @@ def test_each_cloud_has_the_file_of_its_name(plain_twin, ends, truth, poor, tmp_
     for name in names:
         np.save(tmp_path / f"{name}.npy", poor)
     found = moved(plain_twin, ends, truth)
-    write(tmp_path / "marks" / "a.1.csv", found, 1e3)
-    write(tmp_path / "marks" / "c.txt", {name: found[name] for name in ("m0", "m3")} | {"other": np.ones(3)}, 1e3)
+    write(tmp_path / "frame_landmarks" / "a.1.csv", found, 1e3)
+    write(
+        tmp_path / "frame_landmarks" / "c.txt",
+        {name: found[name] for name in ("m0", "m3")} | {"other": np.ones(3)},
+        1e3,
+    )
     body = write(tmp_path / "body.csv", at_rest(plain_twin, ends))
     clouds = [CloudFile(tmp_path / f"{name}.npy", METRES) for name in names]
-    marks = MarkFiles.read(body, tmp_path / "marks", METRES, Coordinates("mm"), [cloud.path for cloud in clouds])
-    rows = register_clouds(plain_twin, clouds, tmp_path / "found", marks=marks, say=lambda line: None)
+    frame_landmarks = LandmarkFiles.read(
+        body, tmp_path / "frame_landmarks", METRES, Coordinates("mm"), [cloud.path for cloud in clouds]
+    )
+    rows = register_clouds(
+        plain_twin, clouds, tmp_path / "found", frame_landmarks=frame_landmarks, say=lambda line: None
+    )
     assert [row.get("landmarks") for row in rows] == [6, None, 2]
     recorded = json.loads((tmp_path / "found" / RECORD).read_text())["frames"]
     assert [row.get("landmarks") for row in recorded] == [6, None, 2]
@@ -86,8 +94,10 @@ def test_landmarks_in_files_do_what_those_in_arrays_do(
     seen = {name: turned(place[None])[0] for name, place in moved(plain_twin, ends, truth).items()}
     file = write(tmp_path / "camera.csv", seen)
     cloud = CloudFile(tmp_path / "cloud.npy", METRES)
-    marks = MarkFiles.read(body, file, METRES, METRES, [cloud.path])
-    (row,) = register_clouds(plain_twin, [cloud], tmp_path / "f", camera=camera, marks=marks, say=lambda line: None)
+    frame_landmarks = LandmarkFiles.read(body, file, METRES, METRES, [cloud.path])
+    (row,) = register_clouds(
+        plain_twin, [cloud], tmp_path / "f", camera=camera, frame_landmarks=frame_landmarks, say=lambda line: None
+    )
     (bare,) = register_clouds(plain_twin, [cloud], tmp_path / "g", camera=camera, say=lambda line: None)
     places = np.array(list(seen.values()))
     direct = plain_twin.register(turned(poor), camera=camera, landmarks=(plain_twin.body.points[ends], places))
@@ -98,14 +108,14 @@ def test_landmarks_in_files_do_what_those_in_arrays_do(
 
 def test_a_stream_takes_them_as_they_come(plain_twin, ends, truth, poor, tmp_path: Path) -> None:
     body = write(tmp_path / "body.csv", at_rest(plain_twin, ends))
-    (tmp_path / "marks").mkdir()
-    marks = MarkFiles.read(body, tmp_path / "marks", METRES, METRES, None)
+    (tmp_path / "frame_landmarks").mkdir()
+    frame_landmarks = LandmarkFiles.read(body, tmp_path / "frame_landmarks", METRES, METRES, None)
     np.save(tmp_path / "now.npy", poor)
-    write(tmp_path / "marks" / "now.csv", moved(plain_twin, ends, truth))
+    write(tmp_path / "frame_landmarks" / "now.csv", moved(plain_twin, ends, truth))
     box = Mailbox()
     box.put(CloudFile(tmp_path / "now.npy", METRES))
     box.close()
-    (row,) = register_live(plain_twin, box, tmp_path / "found", marks=marks, say=lambda line: None)
+    (row,) = register_live(plain_twin, box, tmp_path / "found", frame_landmarks=frame_landmarks, say=lambda line: None)
     assert row["landmarks"] == 6 and row["dropped"] == 0
 
 
@@ -113,30 +123,34 @@ def test_a_frame_whose_landmarks_cannot_be_read_is_refused(plain_twin, ends, tru
     body = write(tmp_path / "body.csv", at_rest(plain_twin, ends))
     for name in ("one", "two"):
         np.save(tmp_path / f"{name}.npy", poor)
-        write(tmp_path / "marks" / f"{name}.csv", moved(plain_twin, ends, truth))
+        write(tmp_path / "frame_landmarks" / f"{name}.csv", moved(plain_twin, ends, truth))
     clouds = [CloudFile(tmp_path / f"{name}.npy", METRES) for name in ("one", "two")]
-    marks = MarkFiles.read(body, tmp_path / "marks", METRES, METRES, [cloud.path for cloud in clouds])
-    (tmp_path / "marks" / "one.csv").write_text("m1,1,2\n")
-    rows = register_clouds(plain_twin, clouds, tmp_path / "found", marks=marks, say=lambda line: None)
+    frame_landmarks = LandmarkFiles.read(
+        body, tmp_path / "frame_landmarks", METRES, METRES, [cloud.path for cloud in clouds]
+    )
+    (tmp_path / "frame_landmarks" / "one.csv").write_text("m1,1,2\n")
+    rows = register_clouds(
+        plain_twin, clouds, tmp_path / "found", frame_landmarks=frame_landmarks, say=lambda line: None
+    )
     assert rows[0]["verdict"] == "refused" and "one.csv: expected points" in rows[0]["reasons"][0]
     assert rows[1]["landmarks"] == 6
 
 
 def test_what_are_no_landmarks_of_the_clouds_is_said_before_the_first(plain_twin, ends, tmp_path: Path) -> None:
     body = write(tmp_path / "body.csv", at_rest(plain_twin, ends))
-    other = write(tmp_path / "marks" / "elsewhere.csv", {"tip": np.zeros(3)})
+    other = write(tmp_path / "frame_landmarks" / "elsewhere.csv", {"tip": np.zeros(3)})
     clouds = [tmp_path / "one.npy", tmp_path / "two.npy"]
     with pytest.raises(ConfigError, match=r"expected files in .* named like the clouds, such as one\.csv .*found none"):
-        MarkFiles.read(body, tmp_path / "marks", METRES, METRES, clouds)
+        LandmarkFiles.read(body, tmp_path / "frame_landmarks", METRES, METRES, clouds)
     for files, words in ((clouds, "2 clouds"), (None, "yet to come")):
         with pytest.raises(ConfigError, match=rf"--frame-landmarks: expected a folder .* got the file .*{words}"):
-            MarkFiles.read(body, other, METRES, METRES, files)
+            LandmarkFiles.read(body, other, METRES, METRES, files)
     with pytest.raises(FileError, match=r"expected landmarks that the body has \(m0, .*\), got tip"):
-        MarkFiles.read(body, other, METRES, METRES, clouds[:1])
+        LandmarkFiles.read(body, other, METRES, METRES, clouds[:1])
     with pytest.raises(
         ConfigError, match=r"--frame-landmarks: .*expected points on the observed surface; point 0 lies"
     ):
-        MarkFiles({"far": np.ones(3)}, other, METRES).check(plain_twin)
+        LandmarkFiles({"far": np.ones(3)}, other, METRES).check(plain_twin)
 
 
 def test_a_contact_of_unknown_place_takes_none(seen_body, ends, tmp_path: Path) -> None:
@@ -150,7 +164,7 @@ def test_a_contact_of_unknown_place_takes_none(seen_body, ends, tmp_path: Path) 
     with Problem(seen_body, NeoHookean(5000.0, 0.45)) as problem:
         twin = Twin(ReferenceModel(problem), Config.model_validate({"registration": section}))
         with pytest.raises(ConfigError, match="landmarks: expected none beside a contact of unknown place"):
-            MarkFiles({"m": np.zeros(3)}, tmp_path, METRES).check(twin)
+            LandmarkFiles({"m": np.zeros(3)}, tmp_path, METRES).check(twin)
 
 
 def test_the_command_line_takes_them(capsys, plain_twin, mesh_folder: Path, ends) -> None:

@@ -62,7 +62,7 @@ def test_the_camera_has_the_noise_the_share_and_the_pose_that_are_asked(body: Bo
     added = noisy.cloud - plain.cloud  # the same chance chooses the same places
     assert added.std() == pytest.approx(2e-3, rel=4 / np.sqrt(2 * added.size))  # four deviations of such an estimate
     assert len(plain.cloud) == POINTS and len(part.cloud) == round(0.3 * POINTS)
-    view = View(0.0, turn=0.1, shift=5e-3)
+    view = View(0.0, rotation=0.1, translation=5e-3)
     misaligned = seen(view)
     assert view.is_misaligned and not View().is_misaligned
     assert np.allclose(pose_of(view, body).inverse().apply(misaligned.cloud), plain.cloud, atol=1e-12)

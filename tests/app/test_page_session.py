@@ -121,7 +121,7 @@ def test_the_organ_that_is_shown_is_the_one_that_was_registered(told: list[Figur
 
 
 def test_a_misaligned_camera_is_found(told: list[Figures]) -> None:
-    view = View(5e-4, turn=np.deg2rad(4.0), shift=5e-3)
+    view = View(5e-4, rotation=np.deg2rad(4.0), translation=5e-3)
     with page_server.serving() as server:
         session = Session(server, find_twin(PHANTOM), is_simulated=True)
         session.controls._sliders[2].value, session.controls._sliders[3].value = 4.0, 5.0

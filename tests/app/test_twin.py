@@ -131,7 +131,7 @@ def test_landmarks_pull_beside_the_cloud(plain_twin: Twin, forces, camera: Pose 
     both = plain_twin.register(turned[0], camera=camera, landmarks=(rest, turned[1]), landmark_deviation=1e-4)
     errors = [np.linalg.norm((found.displacement - truth)[ends], axis=1).mean() for found in (alone, both)]
     assert errors[1] < 0.5 * errors[0]
-    with pytest.raises(ValueError, match="expected points on the observed side at rest"):
+    with pytest.raises(ValueError, match="expected points on the observed surface"):
         plain_twin.register(turned[0], camera=camera, landmarks=(rest + 1.0, turned[1]))
 
 

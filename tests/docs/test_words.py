@@ -138,9 +138,9 @@ def _options(command: Any, path: str) -> Iterator[tuple[str, str]]:
 
 
 def test_no_option_has_a_retired_word() -> None:
-    from softtwin.app.cli import main
+    from softtwin.app.cli import softtwin
 
-    names = list(_options(main, "softtwin"))
+    names = list(_options(softtwin, "softtwin"))
     assert len(names) > 50
     assert not (found := offending_names(names)), "\n".join(["", *found])
 

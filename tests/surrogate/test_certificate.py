@@ -168,7 +168,7 @@ def test_a_load_where_none_was_learned_is_outside_and_not_refused(
     usual, state = estimator.bound_error(load, newton=newton), surrogate.solve(load)
     inner = np.setdiff1d(surrogate.body.free, surrogate.encoder_decoder.loaded)[:2]
     load[inner, 1] = 0.1
-    with pytest.raises(ValueError, match="at 2 other nodes"):
+    with pytest.raises(ValueError, match="got 2 others"):
         surrogate.solve(load)
     found = estimator.bound_error(load, newton=newton)
     assert found.mean == found.largest == np.inf and not found.is_inside
@@ -270,27 +270,21 @@ def test_other_splits_keep_as_many_bounds_and_scatter_as_chance_does(
         assert all(abs(mean - 0.9) < 1.0 / 64 + 3.0 * part / np.sqrt(20) for mean in ranges["mean"])
 
 
-def test_the_table_of_certificates_at_a_small_size(
-    surrogate: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_row_of_the_benchmark_at_a_small_size(
+    surrogate: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is recorded; a row that lacks other splits alone is given these, and one that is whole is left."""
-    rows: dict = {}
     for name, value in {
-        "FAR": 4, "TIMED": 2, "case": lambda body: SimpleNamespace(plan=PLAN), "data_of": lambda *asked: data,
-        "network_of": lambda *asked: surrogate, "recorded": lambda name: rows, "write": lambda name, found: None,
-    }.items():  # fmt: skip
+        "FAR": 4,
+        "TIMED": 2,
+        "data_of": lambda *asked: data,
+        "network_of": lambda *asked: surrogate,
+    }.items():
         monkeypatch.setattr(certificates, name, value)
-    certificates.main(["--bodies", "small", "--stepped", "12"])
-    row = rows["small"]
-    assert row["held_out_newton"]["samples"] == 12 and row["resplit"]["made"]["command"]
-    ms = row["ms"]
-    assert set(ms) == {"prediction", "distance", "extent", "certificate", "newton", "solve"} and min(ms.values()) > 0.0
-    before = {name: row[name] for name in row if name != "resplit"}
-    del row["resplit"]
-    certificates.main(["--bodies", "small"])
-    assert all(row[name] is entry for name, entry in before.items()) and row["resplit"]["ways"] == 20
-    certificates.main(["--bodies", "small"])
-    assert "small: recorded before" in capsys.readouterr().out
+    given = SimpleNamespace(ranks=1, seconds=1.0, stepped=12)
+    row = certificates.work("modal", given)  # type: ignore[arg-type]
+    assert row["held_out_newton"]["samples"] == 12 and row["resplit"]["ways"] == 20
+    assert {"prediction", "distance", "newton", "solve"} <= set(row["ms"]) and min(row["ms"].values()) > 0.0
+    assert [name for name, _ in certificates.lines({"modal": row})]
 
 
 # ---------------------------------------------------------------------- what they are read from
@@ -444,7 +438,7 @@ def test_draws_along_few_load_paths_are_no_more_than_these(tmp_path: Path, small
 
 def test_steps_that_were_never_calibrated_bound_nothing(bare: Surrogate, data: DataSet) -> None:
     estimator = ErrorEstimator(calibrate(bare, data, stepped=0))
-    with pytest.raises(CalibrationError, match=r"ErrorEstimator\.newton: expected a twin whose steps"):
+    with pytest.raises(CalibrationError, match=r"ErrorEstimator\.newton: expected a twin whose Newton steps"):
         estimator.bound_error(loads(data, 1)[0], newton=True)
 
 

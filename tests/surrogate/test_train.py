@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from softtwin.reference.data.dataset import DataSet, DataSetError, drop_block
+from softtwin.reference.data.dataset import DataSet, DataSetError
+from softtwin.reference.data.writing import drop_block
 from softtwin.surrogate import training_module as training
 from softtwin.surrogate.architecture import Architecture
 from softtwin.surrogate.checkpoint import CHECKPOINT, VERSION, CheckpointError
