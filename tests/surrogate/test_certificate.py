@@ -172,7 +172,7 @@ def test_a_load_where_none_was_learned_is_outside_and_not_refused(
         surrogate.solve(load)
     found = estimator.bound_error(load, newton=newton)
     assert found.mean == found.largest == np.inf and not found.is_inside
-    assert "it acts on 2 nodes that never carried load in training: the prediction leaves that out" in found.reasons
+    assert "it acts on 2 nodes that carried no load in training: the prediction leaves that out" in found.reasons
     assert usual.indicators.unseen == 0 and found.indicators.unseen == 2
     assert found.indicators.size == usual.indicators.size
     assert estimator.bound_error(load, state, newton) == found
@@ -276,6 +276,7 @@ def test_the_row_of_the_benchmark_at_a_small_size(
     for name, value in {
         "FAR": 4,
         "TIMED": 2,
+        "case": lambda body: SimpleNamespace(plan=PLAN),
         "data_of": lambda *asked: data,
         "network_of": lambda *asked: surrogate,
     }.items():
