@@ -79,7 +79,7 @@ install() {
 }
 
 install_project() {
-    local pins stamp="$VENV/.softtwin-stamp" made="$VENV/.softtwin-way" origin wanted beside=()
+    local pins stamp="$VENV/.softtwin-stamp" made="$VENV/.softtwin-way" origin wanted numpy beside=()
     origin="$WAY $("$SYSTEM_PYTHON" -V), isolated"
     pins=$(constraints)
     [ "$pins" != /dev/null ] || say "virtual environment: there are no pins for the way $WAY, taking the newest versions"
@@ -98,7 +98,12 @@ install_project() {
     rm -f "$stamp"
     say "virtual environment: installing the project and its dependencies (a minute the first time)"
     # FEniCSx that another Python has is let in by name; what it needs beside, the environment has of its own.
-    if [ "$WAY" = wheels ]; then announce_torch; else beside=(cffi "setuptools<80" "$(same_numpy)"); fi
+    if [ "$WAY" = wheels ]; then
+        announce_torch
+    else
+        numpy=$(same_numpy) # none where apt still brings it: then there are pins
+        beside=(cffi "setuptools<80" ${numpy:+"$numpy"})
+    fi
     install --editable ".[$EXTRAS]" "${beside[@]}"
     rm -rf "$ROOT/softtwin.egg-info" # a by-product: seen from this folder, it makes pkg_resources warn
     if [ -n "$BEHIND" ]; then wait_for_packages; fi
