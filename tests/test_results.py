@@ -40,3 +40,14 @@ def test_a_changed_record_changes_the_page(monkeypatch: pytest.MonkeyPatch) -> N
     load = dashboard.load
     monkeypatch.setattr(dashboard, "load", lambda name: changed if name == "stream" else load(name))
     assert dashboard.placed(page, dashboard.tables()["live"]) != page
+
+
+def test_a_way_takes_the_mean_the_largest_or_the_count_of_a_level() -> None:
+    figures = {"s1": {"errors": [1.0, 2.0]}, "s2": {"errors": [4.0, 3.0]}}
+    ways = {
+        ("*", "errors", "0"): 2.5,
+        (">", "errors", "0"): 4.0,
+        ("s2", "errors", ">"): 4.0,
+        ("s1", "errors", "#"): 2.0,
+    }
+    assert {way: dashboard._at(figures, way) for way in ways} == ways
