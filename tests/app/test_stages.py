@@ -378,6 +378,7 @@ def test_two_trainings_in_one_folder_are_one_too_many(copy: Path, monkeypatch: p
 
 
 @pytest.mark.chain
+@pytest.mark.slow
 def test_a_twin_on_a_regular_grid_registers_clouds_of_the_surface(capsys, tmp_path: Path) -> None:
     """`build --grid`: the surface rides in hexahedra, which U-Mesh learns on too; clouds are matched to it."""
     write_files(tmp_path, bar())
