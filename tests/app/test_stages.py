@@ -322,7 +322,7 @@ def test_ranks_end_together_with_one_message(
     elif case == "no configuration":
         (copy / "organ.toml").write_text("[body\n")
     else:
-        edit(copy, "ramp = 1", "ramp = 5")
+        edit(copy, "load_path = 1", "load_path = 5")
     if "fixed" in case:
         main(["mesh", str(copy / "organ.toml")])
     program = [sys.executable, "-m", "softtwin.app.cli", "generate", str(copy / "organ.toml")]

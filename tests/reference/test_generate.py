@@ -38,7 +38,7 @@ PROGRAM = """
 import sys
 from softtwin.meshes.shapes import beam
 from softtwin.reference.generate import Plan, generate
-from softtwin.reference.data.shard import Part
+from softtwin.reference.data.shard import Shard
 from softtwin.reference.data.samplers import LoadPlan
 plan = Plan(loads=LoadPlan(modes=6, displacement=0.08), block=3, seed=5,
             samples={"train": 9, "validation": 3, "test": 4, "calibration": 2})
