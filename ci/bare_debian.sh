@@ -45,6 +45,7 @@ if [ ! -f "$TREE/.softtwin-stamp" ]; then
 fi
 cp /etc/resolv.conf "$TREE/etc/"
 cp /etc/ssl/certs/ca-certificates.crt "$TREE/etc/ssl/certs/" # with what this machine trusts besides
+printf '127.0.0.1 localhost %s\n' "$(hostname)" >"$TREE/etc/hosts" # debootstrap writes none, and torch's processes ask
 BOUND=(/proc /dev /sys)
 for folder in ${PIP_FIND_LINKS:-}; do # wheels that lie on this machine's disk
     [ -d "$folder" ] && BOUND+=("$folder")

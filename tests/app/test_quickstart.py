@@ -82,6 +82,7 @@ def test_the_card_says_what_the_twin_is(made: Path) -> None:
 
 
 @pytest.mark.chain
+@pytest.mark.slow
 def test_running_again_makes_nothing_twice(copy: Path, capsys) -> None:
     """The second run finds mesh and equilibria: their files keep their times."""
     stamps = {path: path.stat().st_mtime_ns for path in (copy / "body.vtu", copy / "data.zarr" / "zarr.json")}

@@ -70,6 +70,7 @@ def copied(made: Workspace, tmp_path: Path) -> Workspace:
 # ---------------------------------------------------------------------- what is chosen
 
 
+@pytest.mark.slow
 def test_each_round_takes_other_candidates_of_its_own_pool(made: Workspace) -> None:
     data = DataSet(made.data)
     assert data.chosen.shape == (8,) and len(set(data.chosen)) == 8

@@ -322,7 +322,7 @@ def test_ranks_end_together_with_one_message(
     elif case == "no configuration":
         (copy / "organ.toml").write_text("[body\n")
     else:
-        edit(copy, "ramp = 1", "ramp = 5")
+        edit(copy, "load_path = 1", "load_path = 5")
     if "fixed" in case:
         main(["mesh", str(copy / "organ.toml")])
     program = [sys.executable, "-m", "softtwin.app.cli", "generate", str(copy / "organ.toml")]
@@ -378,6 +378,7 @@ def test_two_trainings_in_one_folder_are_one_too_many(copy: Path, monkeypatch: p
 
 
 @pytest.mark.chain
+@pytest.mark.slow
 def test_a_twin_on_a_regular_grid_registers_clouds_of_the_surface(capsys, tmp_path: Path) -> None:
     """`build --grid`: the surface rides in hexahedra, which U-Mesh learns on too; clouds are matched to it."""
     write_files(tmp_path, bar())

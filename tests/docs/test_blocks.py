@@ -166,6 +166,7 @@ def test_a_page_shows_a_page(page: str, here: Path, monkeypatch: pytest.MonkeyPa
 @pytest.mark.fenicsx
 @pytest.mark.chain
 @pytest.mark.parametrize("page", WHOLE)
+@pytest.mark.slow
 def test_a_page_runs_from_its_beginning_to_its_end(page: str, here: Path, capsys) -> None:
     """Commands as a shell runs them, Python beside them."""
     pytest.importorskip("petsc4py", reason="FEniCSx is absent")

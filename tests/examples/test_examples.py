@@ -175,6 +175,7 @@ jacobians = false
 
 
 @pytest.mark.fenicsx
+@pytest.mark.slow
 def test_an_array_of_jobs_under_plain_bash(tmp_path: Path) -> None:
     """Two of three tasks at the same moment; the third is lost, which is told, and made alone as an array of one.
 

@@ -38,7 +38,7 @@ PROGRAM = """
 import sys
 from softtwin.meshes.shapes import beam
 from softtwin.reference.generate import Plan, generate
-from softtwin.reference.data.shard import Part
+from softtwin.reference.data.shard import Shard
 from softtwin.reference.data.samplers import LoadPlan
 plan = Plan(loads=LoadPlan(modes=6, displacement=0.08), block=3, seed=5,
             samples={"train": 9, "validation": 3, "test": 4, "calibration": 2})
@@ -233,6 +233,7 @@ def test_options_that_came_later_had_their_defaults_before(undisturbed: DataSet,
         generate(path, body(), replace(PLAN, newton=NewtonOptions(max_load_steps=3)))
 
 
+@pytest.mark.slow
 def test_two_do_not_write_one_data_set(undisturbed: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lock is the system's: it goes with the process that holds it, even where that is killed."""
     from softtwin.reference import generate as farm

@@ -201,6 +201,7 @@ def test_incompressible_tissue_keeps_its_volume(tetrahedra: Body) -> None:
     assert moved.volume == pytest.approx(body.volume, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_nearly_incompressible_mixed_meets_the_compressible_law(tetrahedra: Body) -> None:
     body = tetrahedra.quadratic()
     compressible = MooneyRivlin(400.0, 300.0, 8000.0)

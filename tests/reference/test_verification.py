@@ -178,6 +178,7 @@ def test_every_sensitivity_passes_a_taylor_test(size: float) -> None:
 
 
 @pytest.mark.parametrize("size", [0.02, 1.0])
+@pytest.mark.slow
 def test_every_sensitivity_of_a_mixed_material_passes_a_taylor_test(size: float) -> None:
     assert_taylor(taylor(incompressible(0.05)["incompressible Neo-Hookean"], "triangle6", size))
 
@@ -191,6 +192,7 @@ def test_sensitivities_by_parameters_of_each_cell_pass_taylor_tests(size: float)
 # ---------------------------------------------------------------------- published figures, locking
 
 
+@pytest.mark.slow
 def test_cooks_slab_has_the_displacements_that_dealii_publishes() -> None:
     case = cooks()["slab"]
     linear = replace(case, tables={"hexahedron": case.tables["hexahedron"]})

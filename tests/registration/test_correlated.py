@@ -84,6 +84,7 @@ def test_its_size_and_length_are_told(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("scale", [2e-4, 1e-3])
+@pytest.mark.slow
 def test_noise_of_single_points_is_not_taken_for_it(rng: np.random.Generator, scale: float) -> None:
     noise, force = LogNormalPrior(5e-4, 1.5, minimum=1e-4), LogNormalPrior(1e-3, 1.0)
     for _ in range(12):
@@ -160,6 +161,7 @@ def test_residuals_have_the_derivative_that_they_say(body: Body, rng: np.random.
     np.testing.assert_allclose(pulled, problem.jacobian(at).T @ cotangent, rtol=1e-8, atol=1e-9 * np.abs(pulled).max())
 
 
+@pytest.mark.slow
 def test_forces_are_as_far_off_as_they_say(body: Body) -> None:
     """Net forces across the beam: z^2 = e' S^-1 e / 2."""
     made, scores, told = registrar(body), [], []

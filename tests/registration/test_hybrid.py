@@ -72,6 +72,7 @@ def with_random_weights(network: Surrogate) -> Surrogate:
 
 
 @pytest.mark.parametrize("size", [1.0, 2.0])
+@pytest.mark.slow
 def test_a_network_saves_factorisations_and_changes_no_state(
     problem: Problem, network: Surrogate, data: DataSet, size: float
 ) -> None:

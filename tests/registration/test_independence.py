@@ -56,6 +56,7 @@ def test_small_residuals_and_few_points_are_left_alone(rng: np.random.Generator)
 
 
 @pytest.mark.fenicsx
+@pytest.mark.slow
 def test_shared_noise_is_no_force(body: Body, rng: np.random.Generator) -> None:
     """With every point believed, its forces were off by five of their deviations; clean clouds change nothing."""
     pytest.importorskip("petsc4py", reason="FEniCSx is absent")

@@ -75,6 +75,7 @@ def test_an_error_of_known_shape_is_put_right(body: Body, rng) -> None:
     np.testing.assert_array_equal(known.displacement, known.state.displacement + known.correction)
 
 
+@pytest.mark.slow
 def test_doubt_of_the_net_force_knows_of_the_models_error(body: Body) -> None:
     """Errors drawn from their own law: z^2 = e' S^-1 e / 2 has a mean near 1.
 

@@ -116,6 +116,7 @@ def test_a_dense_cloud_tells_no_more_than_a_thinned_one(body: Body) -> None:
     assert told[1] == pytest.approx(told[0], rel=0.2)
 
 
+@pytest.mark.slow
 def test_a_dense_cloud_promises_no_more_than_its_patches_allow(body: Body) -> None:
     """50,000 points, all used, whose noise is a smooth field: as many tell what one would as share a patch.
 

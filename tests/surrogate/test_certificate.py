@@ -91,6 +91,7 @@ def test_as_many_samples_keep_their_bounds_as_should(surrogate: Surrogate, data:
     assert found.outside / found.samples < share + 3.0 * np.sqrt(2.0 * share / 256)
 
 
+@pytest.mark.slow
 def test_bounds_from_a_newton_step_are_kept_as_often_and_tighter(surrogate: Surrogate, data: DataSet) -> None:
     """Three deviations of what chance leaves in a hundred samples that calibrate and 256 that judge."""
     found, usual = (coverage(surrogate, data, newton=newton) for newton in (True, False))
@@ -101,6 +102,7 @@ def test_bounds_from_a_newton_step_are_kept_as_often_and_tighter(surrogate: Surr
     assert usual.step_correlation["mean"] > 0.85
 
 
+@pytest.mark.slow
 def test_where_a_prediction_is_stable_its_newton_step_is_nearly_its_error(surrogate: Surrogate, data: DataSet) -> None:
     """Elsewhere the step leads to another state, or nowhere: a third of so rough a network's predictions.
 
@@ -421,6 +423,7 @@ def test_too_few_samples_are_refused_with_how_many_are_needed(bare: Surrogate, d
         calibrate(bare, data, confidence=0.999)
 
 
+@pytest.mark.slow
 def test_draws_along_few_load_paths_are_no_more_than_these(tmp_path: Path, small: Body) -> None:
     """32 draws along eight paths make no bound of 90 %; along twelve they do, and the ranges are told."""
     counts = {"train": 32, "validation": 16, "test": 8, "calibration": 32}
@@ -464,6 +467,7 @@ def test_data_of_another_material_are_refused(bare: Surrogate, data: DataSet) ->
         calibrate(bare.with_card(data={**bare.card["data"], "plan": plan}), data)
 
 
+@pytest.mark.slow
 def test_loads_drawn_otherwise_are_told(bare: Surrogate, data: DataSet) -> None:
     plan = {
         **bare.card["data"]["plan"],

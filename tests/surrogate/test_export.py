@@ -63,6 +63,7 @@ def test_every_architecture_is_exported_here() -> None:
     assert set(KINDS) == set(ARCHITECTURES)
 
 
+@pytest.mark.slow
 def test_displacements_are_those_of_torch_in_batches_of_any_size(
     pair: tuple[Surrogate, Path], forces: np.ndarray
 ) -> None:
@@ -117,6 +118,7 @@ def test_directions_are_those_that_move_the_body_most(data: DataSet) -> None:
         leading_directions(surrogate, 0)
 
 
+@pytest.mark.slow
 def test_graphs_of_another_twin_are_refused(copy: Path, data: DataSet, tmp_path: Path) -> None:
     for seed, name in enumerate(("one", "another")):
         plan = TrainingPlan(KINDS["reduced"], epochs=1, seed=seed)

@@ -81,6 +81,7 @@ def test_a_fresh_network_that_turns_cells_inside_out_still_learns(objective: Any
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow
 def test_energy_alone_brings_the_network_nearer_to_balance(kind: str, soft: DataSet) -> None:
     """The labels are of another law: whoever learns from them ends at a higher energy."""
     samples = soft.samples("train")

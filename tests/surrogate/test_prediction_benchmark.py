@@ -30,6 +30,7 @@ def quick(tmp_path: Path, data: DataSet, monkeypatch: pytest.MonkeyPatch) -> Ite
     torch.set_num_threads(threads)
 
 
+@pytest.mark.slow
 def test_every_network_is_timed_once(quick: None, data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["--data", str(data.path), "--device", "cpu"]
     harness.run(prediction.BENCHMARK, words)

@@ -212,6 +212,7 @@ def test_the_loss_of_jacobians_is_their_frobenius_error(differentiated: DataSet)
     assert found == pytest.approx(expected / 3, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_jacobians_are_learned_from(differentiated: DataSet, data: DataSet) -> None:
     """In the coordinates of the modes, in all directions, on samples that were not learned from."""
     plans = [TrainingPlan(Reduced(6, 32, 2, weight), samples=12, epochs=1000) for weight in (0.0, 0.3)]

@@ -118,6 +118,7 @@ def test_the_same_plan_gives_the_same_weights(data: DataSet, short: TrainingPlan
     [(Perceptron(16), 8), (Reduced(modes=6, width=16, depth=2, sobolev=0.3), 2)],
     ids=["mlp", "reduced, with gradients"],
 )
+@pytest.mark.slow
 def test_two_processes_learn_what_one_learns(
     data: DataSet, tmp_path: Path, capfd, architecture: Architecture, epochs: int
 ) -> None:
@@ -150,6 +151,7 @@ class Counted:
 """
 
 
+@pytest.mark.slow
 def test_the_clock_of_the_first_process_ends_all(
     data: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -443,6 +445,7 @@ def test_settings_of_a_network_out_of_range_are_refused(settings: Any, message: 
         settings()
 
 
+@pytest.mark.slow
 def test_training_that_gets_no_better_ends_early(
     data: DataSet, small_plan: TrainingPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -133,6 +133,7 @@ def test_what_the_grid_holds_outside_of_the_body_is_not_learned_from(sparse: Dat
     assert torch.equal(objective.loss(batch).detach(), plain)
 
 
+@pytest.mark.slow
 def test_a_body_on_a_sparse_grid_is_learned_and_predicted(sparse: DataSet, tmp_path: Path) -> None:
     surrogate = train(sparse, TrainingPlan(UMesh(channels=12, levels=2), batch=8, epochs=30))
     assert evaluate(surrogate, sparse).relative_error.median < 0.7  # 1 for a prediction of nothing
