@@ -70,6 +70,14 @@ def shares(covered: Mapping[str, float]) -> str:
     return " / ".join(f"{100 * share:.0f}" for share in covered.values())
 
 
+def replaced(page: str, printed: str) -> str:
+    """A page with each of its tables that are printed, too, as it is printed; the text around them is kept."""
+    new = tables_of(printed)
+    for heading, old in tables_of(page).items():
+        page = page.replace(old, new.get(heading, old))
+    return page
+
+
 def tables_of(page: str) -> dict[str, str]:
     """The tables of a page in Markdown, by their first headings."""
     found = re.findall(r"(?:^\|.*\n?)+", page, flags=re.MULTILINE)

@@ -26,7 +26,7 @@ from typing import Any
 
 import record
 from audit import audit, declarations, listed
-from columns import Column, cell, markdown, tables_of
+from columns import Column, cell, markdown, replaced
 
 Figures = dict[str, Any]
 
@@ -354,10 +354,7 @@ def main(words: Sequence[str] | None = None) -> None:
         if options.into is None:
             print(printed, end="")
             return
-        page, new = options.into.read_text(), tables_of(printed)
-        for heading, old in tables_of(page).items():
-            page = page.replace(old, new.get(heading, old))
-        options.into.write_text(page)
+        options.into.write_text(replaced(options.into.read_text(), printed))
         return
     if options.what == "list":
         print(listed())

@@ -7,7 +7,7 @@ by name (`group["samples"]["reason"][2:5]`, `name in group`, `group.attrs`).
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +101,7 @@ def _read_tensors(path: Path) -> TensorGroup:
     try:
         with safe_open(path, framework="numpy") as opened:
             metadata: dict[str, str] = opened.metadata() or {}
-            arrays = {name: opened.get_tensor(name) for name in _names(opened.keys())}
+            arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  (a handle, no mapping)
     except (SafetensorError, OSError) as error:
         raise StoreError(f"{path} cannot be read ({error}); is it truncated, or no safetensors file?") from error
     if metadata.get("format") != _FORMAT or metadata.get("version") != str(_VERSION):
@@ -110,7 +110,3 @@ def _read_tensors(path: Path) -> TensorGroup:
             f"{metadata.get('version', '')}; make it again with `softtwin tensors`."
         )
     return TensorGroup(arrays, json.loads(metadata["attributes"]))
-
-
-def _names(keys: Iterable[str]) -> list[str]:
-    return list(keys)

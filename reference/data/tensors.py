@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import schema
-from .dataset import NEEDED, SPLITS, DataSet, checksum
+from .dataset import NEEDED, SPLITS, DataSet, DataSetError, checksum
 from .jacobians import missing_jacobians
 from .store import is_tensors, write_tensors
 
@@ -33,26 +33,38 @@ def export_tensors(data: DataSet, path: Path | str, precision: Precision = "sing
 
     Raises:
         ValueError: another ending, or another precision.
-        DataSetError: blocks of the data set are missing or damaged.
+        DataSetError: a tensors file already; blocks of the data set, or of its Jacobians where they are wanted, are
+            missing or damaged.
     """
     target = Path(path)
     if not is_tensors(target):
         raise ValueError(f"export_tensors.path: expected a name that ends in .safetensors, got {target.name}.")
     if precision not in get_args(Precision):
         raise ValueError(f"export_tensors.precision: expected one of {get_args(Precision)}, got {precision!r}.")
+    if is_tensors(data.path):
+        raise DataSetError(
+            f"export_tensors.data: expected the folder of a Zarr store, got the tensors file {data.path}."
+        )
     for split in SPLITS:
         if split in NEEDED or data.header["samples"].get(split):
             data.check_complete(split)
     real = np.dtype(np.float32 if precision == "single" else np.float64)
     root = data.root
-    arrays = _fixed(root, list(data.header["checksums"]), real) if data.header.get("checksums") else _stored(root, real)
+    arrays = {name: root[name][:] for name in _names(root)}  # the body as it is: its fingerprint is of these bytes
+    arrays |= {name: _rounded(arrays[name], real) for name in arrays if name.startswith("response/")}
+    checksums = {name: zlib.crc32(values.tobytes()) for name, values in arrays.items()}
     arrays |= _samples(root["samples"], data.header["block"], real)
     if "active" in root:
         arrays["active/ramps"] = root["active/ramps"][:]
-    checksums = {name: zlib.crc32(values.tobytes()) for name, values in arrays.items() if _is_fixed(name)}
     header = {**data.header, "checksums": checksums, "tensors": {"precision": precision, "made_from": data.identity}}
     attributes: dict[str, dict[str, Any]] = {"": {"header": json.dumps(header)}}
-    if jacobians and "jacobians" in root and not missing_jacobians(data):
+    if jacobians and "jacobians" in root:
+        missing = missing_jacobians(data)
+        if missing:
+            raise DataSetError(
+                f"export_tensors.data: expected the Jacobians of all training samples in {data.path}, got none in "
+                f"{len(missing)} blocks; run `softtwin generate` again, or leave them out (`--no-jacobians`)."
+            )
         group = root["jacobians"]
         arrays |= {f"jacobians/{name}": group[name][:] for name in ("modes", "values", "squares", "checksum")}
         attributes["jacobians"] = {"checksum": int(group.attrs["checksum"])}
@@ -60,25 +72,11 @@ def export_tensors(data: DataSet, path: Path | str, precision: Precision = "sing
     return target
 
 
-def _is_fixed(name: str) -> bool:
-    return name.split("/")[0] in ("body", "response", "modes")
-
-
-def _fixed(root: Any, names: list[str], real: np.dtype[Any]) -> Arrays:
-    """What no block holds. The body stays in double precision: its fingerprint is of these bytes."""
-    return {name: _rounded(root[name][:], real) if name.startswith("response/") else root[name][:] for name in names}
-
-
-def _stored(root: Any, real: np.dtype[Any]) -> Arrays:
-    """Likewise of a data set without checksums of them."""
-    return _fixed(root, list(_names(root)), real)
-
-
 def _names(group: Any, prefix: str = "") -> Iterator[str]:
+    """Whole names of the arrays that no block holds: body, response and modes."""
     for name, one in group.members():
-        if not prefix and not _is_fixed(name):
-            continue
-        yield from _names(one, f"{prefix}{name}/") if hasattr(one, "members") else [f"{prefix}{name}"]
+        if prefix or name in ("body", "response", "modes"):
+            yield from _names(one, f"{prefix}{name}/") if hasattr(one, "members") else [f"{prefix}{name}"]
 
 
 def _rounded(values: NDArray[Any], real: np.dtype[Any]) -> NDArray[Any]:

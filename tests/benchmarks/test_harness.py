@@ -302,3 +302,10 @@ def test_every_script_here_declares_what_it_records() -> None:
         assert each.title and not each.title.endswith("."), each.script
     orphans = [path.stem for path in record.RESULTS.glob("*.json") if not any(d.declares(path.stem) for d in declared)]
     assert orphans == []
+
+
+def test_a_table_is_replaced_and_the_text_around_it_kept() -> None:
+    page = "before\n\n| a | b |\n| --- | --- |\n\nbetween\n\n| c |\n| --- |\n| 1 |\n\nafter\n"
+    printed = "\n| a | b |\n| --- | --- |\n| 1 | 2 |\n"
+    wanted = "before\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n\nbetween\n\n| c |\n| --- |\n| 1 |\n\nafter\n"
+    assert columns.replaced(page, printed) == wanted

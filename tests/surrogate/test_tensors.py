@@ -137,3 +137,21 @@ def test_the_command_writes_it(data: DataSet, tmp_path: Path) -> None:
 def test_another_ending_is_refused(data: DataSet, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\.safetensors"):
         export_tensors(data, tmp_path / "set.npz")
+
+
+def test_jacobians_that_are_not_all_there_are_not_left_out_in_silence(data: DataSet, tmp_path: Path) -> None:
+    import shutil
+
+    from softtwin.reference.data.jacobians import prepare_jacobians
+
+    shutil.copytree(data.path, tmp_path / "copy.zarr")
+    copied = DataSet(tmp_path / "copy.zarr")
+    prepare_jacobians(copied, np.eye(data.body.points.size)[:, :4])
+    with pytest.raises(DataSetError, match=r"Jacobians of all training samples .* got none in \d+ blocks"):
+        export_tensors(copied, tmp_path / "set.safetensors")
+    assert len(DataSet(export_tensors(copied, tmp_path / "set.safetensors", jacobians=False)).samples("train"))
+
+
+def test_a_tensors_file_is_not_exported_again(data: DataSet, tmp_path: Path) -> None:
+    with pytest.raises(DataSetError, match="got the tensors file"):
+        export_tensors(exported(data, tmp_path), tmp_path / "again.safetensors")
