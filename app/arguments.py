@@ -117,11 +117,12 @@ class GenerateArguments(Section):
 
     redo: tuple[int, ...] = option((), "number of a block to make again", basic=True)
     again: bool = option(False, "throw a data set that is there away, and make it anew", basic=True)
-    part: str | None = option(
+    shard: str | None = option(
         None,
-        "solve part I of N alone, I from 0, beside other jobs (examples/slurm.sh)",
+        "solve shard I of N alone, I from 0, beside other jobs (examples/slurm.sh)",
         basic=True,
         metavar="I/N",
+        old=("part",),
     )
 
 

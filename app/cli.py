@@ -101,21 +101,21 @@ def mesh(configuration: Path) -> None:
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
 @flags(GenerateArguments)
-def generate(configuration: Path, redo: tuple[int, ...], again: bool, part: str | None) -> None:
+def generate(configuration: Path, redo: tuple[int, ...], again: bool, shard: str | None) -> None:
     """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped.
 
     Blocks that are damaged are found and made again. Another body or configuration is refused. Once all parts of an
-    array of jobs have ended, `generate` without `--part` makes what is missing, and the Jacobians.
+    array of jobs have ended, `generate` without `--shard` makes what is missing, and the Jacobians.
     """
     from softtwin.reference.data.shard import Shard
 
     from .stages.generate import describe_data, generate_stage
 
-    chosen = None if part is None else Shard.parse(part)
+    chosen = None if shard is None else Shard.parse(shard)
     data = generate_stage(configuration, redo, again, chosen)
     if data is not None and chosen is not None:
         missing = len(data.missing_blocks())
-        click.echo(f"part {chosen}: done; {missing} of {data.block_count} blocks of {data.path} are still missing")
+        click.echo(f"shard {chosen}: done; {missing} of {data.block_count} blocks of {data.path} are still missing")
     elif data is not None:
         click.echo(describe_data(data))
         click.echo(f"written to {data.path}")

@@ -123,7 +123,7 @@ def shown(value: float, digits: int) -> str:
 
 def table(rows: Iterable[Row]) -> str:
     """Rows as a table in Markdown."""
-    lines = ["| quantity | ours | thesis or best peer | asked | record of |", "|---|---|---|---|---|"]
+    lines = ["| quantity | ours | thesis or best peer | target | record of |", "|---|---|---|---|---|"]
     for row in rows:
         ours = f"{shown(row.value, row.digits)} {row.unit}".strip()
         asked = "" if row.target is None else f"{'at most' if row.most else 'at least'} {row.target:g}"

@@ -15,4 +15,4 @@ PARTS=${SOFTTWIN_PARTS:-16} # not SLURM_ARRAY_TASK_COUNT: that is 1 where one ta
 if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
     SLURM_ARRAY_TASK_ID=0 PARTS=1
 fi
-softtwin generate "${1:?organ.toml}" --part "$SLURM_ARRAY_TASK_ID/$PARTS"
+softtwin generate "${1:?organ.toml}" --shard "$SLURM_ARRAY_TASK_ID/$PARTS"

@@ -130,7 +130,7 @@ def generate(
     comm: Any = MPI.COMM_WORLD,
     redo: Sequence[int] = (),
     again: bool = False,
-    part: Shard | None = None,
+    shard: Shard | None = None,
     task: Task | None = None,
 ) -> DataSet | None:
     """Make a data set, or go on with one that was interrupted; collective over the communicator.
@@ -146,7 +146,7 @@ def generate(
         comm: the ranks that share the work.
         redo: numbers of blocks to make again.
         again: throw away what is there.
-        part: solve the blocks of one part alone, beside other jobs that solve the others; the first to come prepares
+        shard: solve the blocks of one shard alone, beside other jobs that solve the others; the first to come prepares
             the data set.
         task: what solves a block, in place of `solve_block`; read on rank 0 alone.
 
@@ -159,14 +159,14 @@ def generate(
         FailedElsewhere: on the others, where rank 0 raises one of these or what else went wrong, on any rank.
         ValueError: loads that the body cannot carry.
     """
-    if part is not None and (redo or again):
-        raise DataSetError("generate.part: expected no blocks to redo and nothing to throw away beside a part.")
+    if shard is not None and (redo or again):
+        raise DataSetError("generate.shard: expected no blocks to redo and nothing to throw away beside a shard.")
     with threadpool_limits(1), ExitStack() as held:  # sums by several BLAS threads differ in their last bits
 
         def prepare() -> tuple[Path, list[int]]:
             assert path is not None and body is not None and plan is not None, "rank 0 gives all three"
-            if part is not None:
-                return Path(path), _prepare_part(Path(path), body, plan, part, held)
+            if shard is not None:
+                return Path(path), _prepare_shard(Path(path), body, plan, shard, held)
             held.enter_context(writing(Path(path)))
             refuse_shards_at_work(Path(path))
             return Path(path), _prepare(Path(path), body, plan, redo, again)
@@ -185,22 +185,22 @@ def writing(path: Path, patience: float = _PATIENCE_S) -> Iterator[None]:
         yield
 
 
-def _prepare_part(path: Path, body: Body, plan: Plan, part: Shard, held: ExitStack) -> list[int]:
-    """The blocks of a part that are to be solved; who comes while another prepares the data set waits for that."""
+def _prepare_shard(path: Path, body: Body, plan: Plan, shard: Shard, held: ExitStack) -> list[int]:
+    """The blocks of a shard that are to be solved; who comes while another prepares the data set waits for that."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    held.enter_context(at_work_on(path, part))
+    held.enter_context(at_work_on(path, shard))
     with writing(path, _PREPARING_S):
-        return [block for block in _prepare(path, body, plan, (), False, part) if part.has(block)]
+        return [block for block in _prepare(path, body, plan, (), False, shard) if shard.has(block)]
 
 
 def _prepare(
-    path: Path, body: Body, plan: Plan, redo: Sequence[int], again: bool, part: Shard | None = None
+    path: Path, body: Body, plan: Plan, redo: Sequence[int], again: bool, shard: Shard | None = None
 ) -> list[int]:
     """Make the data set where there is none; returns the numbers of the blocks to solve."""
     check_loads(body, plan.loads)
     present = None if again else existing(path)
     if present is not None and not _is_another(present, body, plan):
-        return _unfinished(present, redo, part)
+        return _unfinished(present, redo, shard)
     if redo:
         raise DataSetError(f"generate.redo: expected a data set with blocks {list(redo)} in {path}, found none.")
     with Problem(body, plan.build_material(), plan.newton) as problem:
@@ -219,7 +219,7 @@ def _prepare(
     return _solvable(create(path, header, body, response, modes.shapes, modes.eigenvalues))
 
 
-def _unfinished(present: DataSet, redo: Sequence[int], part: Shard | None) -> list[int]:
+def _unfinished(present: DataSet, redo: Sequence[int], shard: Shard | None) -> list[int]:
     count = present.block_count
     wrong = [block for block in redo if not 0 <= block < count]
     if wrong:
@@ -229,7 +229,7 @@ def _unfinished(present: DataSet, redo: Sequence[int], part: Shard | None) -> li
         raise DataSetError(
             f"generate.redo: {present.path} was merged from others; make the block again in its own set."
         )
-    damaged = present.damaged_blocks([block for block in range(count) if part is None or part.has(block)])
+    damaged = present.damaged_blocks([block for block in range(count) if shard is None or shard.has(block)])
     if present.header.get("merged") and (damaged or present.missing_blocks()):
         raise DataSetError(
             f"generate.path: {present.path} was merged from others and lacks blocks, or has damaged ones; merge again."

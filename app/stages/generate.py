@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 
 def generate_stage(
-    configuration: Path, redo: Sequence[int] = (), again: bool = False, part: Shard | None = None
+    configuration: Path, redo: Sequence[int] = (), again: bool = False, shard: Shard | None = None
 ) -> DataSet | None:
     """Solve the equilibria of the data set, those of active rounds after the others, and their Jacobians where wanted.
 
@@ -37,7 +37,7 @@ def generate_stage(
         configuration: the configuration file, read on rank 0 alone.
         redo: numbers of blocks to make again.
         again: throw away what is there.
-        part: solve the blocks of one part alone, and of active rounds what they have chosen already; what is missing in
+        shard: solve the blocks of one shard alone, and of active rounds what they have chosen already; what is missing in
             the end, further rounds and the Jacobians, the whole stage makes.
 
     Raises:
@@ -51,9 +51,9 @@ def generate_stage(
     from softtwin.reference.generate import generate, plan_from_header
 
     comm, begin = MPI.COMM_WORLD, time.perf_counter()
-    asked = on_first(comm, lambda: _read(configuration, part))
+    asked = on_first(comm, lambda: _read(configuration, shard))
     if asked is None:
-        generate(None, None, None, comm, part=part)
+        generate(None, None, None, comm, shard=shard)
         while comm.bcast(None, root=0) is not None:
             on_first(comm, lambda: None)
             generate(None, None, None, comm)
@@ -64,18 +64,18 @@ def generate_stage(
     space, body, active = asked
     plan = plan_from_header({"plan": plan_entries(space.config)})
     task = active.solver(space.config) if active else None
-    data = generate(space.data, body, plan, comm, redo, again, part, task)
+    data = generate(space.data, body, plan, comm, redo, again, shard, task)
     assert data is not None
-    while active and part is None and (number := active.next_round(space.config, data)) is not None:
+    while active and shard is None and (number := active.next_round(space.config, data)) is not None:
         comm.bcast(number, root=0)
         on_first(comm, partial(active.choose, space, data, number))
         data = generate(space.data, body, plan, comm, task=task)
         assert data is not None
     comm.bcast(None, root=0)
-    if comm.bcast(part is None and space.config.wants_jacobians, root=0):
+    if comm.bcast(shard is None and space.config.wants_jacobians, root=0):
         modes = on_first(comm, lambda: jacobian_modes(space.config, data))
         differentiate(space.data, modes, comm)
-    if part is None:
+    if shard is None:
         record_stage(space, "generate", time.perf_counter() - begin, generate_inputs(space, body))
     return data
 
@@ -126,17 +126,17 @@ def describe_data(data: DataSet) -> str:
     )
 
 
-def _read(configuration: Path, part: Shard | None) -> tuple[Workspace, Body, Any]:
+def _read(configuration: Path, shard: Shard | None) -> tuple[Workspace, Body, Any]:
     """The workspace, its body, and what active rounds are made with."""
     space = open_workspace(configuration)
     try:
         active = _active_rounds(space.config)
     except ConfigError as error:
-        if part is None:
+        if shard is None:
             raise
         active = None  # a job of a cluster may do without torch
         warnings.warn(
-            f"part {part}: {error} Draws that such rounds have chosen already are solved from rest, to the same "
+            f"shard {shard}: {error} Draws that such rounds have chosen already are solved from rest, to the same "
             "equilibria in more iterations.",
             stacklevel=2,
         )

@@ -17,8 +17,8 @@ class Shard:
     """Every so-manieth block of a data set.
 
     Args:
-        number: of the part, from 0.
-        count: of parts.
+        number: of the shard, from 0.
+        count: of all shards.
     """
 
     number: int
@@ -26,18 +26,18 @@ class Shard:
 
     def __post_init__(self) -> None:
         if not 0 <= self.number < self.count:
-            raise DataSetError(f"Shard.number: expected 0..{self.count - 1} of {self.count} parts, got {self.number}.")
+            raise DataSetError(f"Shard.number: expected 0..{self.count - 1} of {self.count} shards, got {self.number}.")
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """A part from words like `3/16`: the fourth of sixteen.
+        """A shard from words like `3/16`: the fourth of sixteen.
 
         Raises:
             DataSetError: other words, or a number that is not there.
         """
         found = re.fullmatch(r"(\d+)/(\d+)", text.strip())
         if found is None:
-            raise DataSetError(f"part: expected NUMBER/COUNT like 3/16, counted from 0, got {text!r}.")
+            raise DataSetError(f"shard: expected NUMBER/COUNT like 3/16, counted from 0, got {text!r}.")
         return cls(int(found[1]), int(found[2]))
 
     def has(self, block: int) -> bool:
@@ -49,14 +49,14 @@ class Shard:
 
 
 @contextmanager
-def at_work_on(path: Path, part: Shard) -> Iterator[None]:
-    """Keep others from the same part of a data set.
+def at_work_on(path: Path, shard: Shard) -> Iterator[None]:
+    """Keep others from the same shard of a data set.
 
     Raises:
         DataSetError: somebody else is at work on it.
     """
-    refusal = f"generate.part: another `generate` is at work on part {part} in {path}; wait for it, or end it."
-    with locked(_lock(path, f"{part.number}-of-{part.count}"), DataSetError(refusal), 0.0):
+    refusal = f"generate.shard: another `generate` is at work on shard {shard} in {path}; wait for it, or end it."
+    with locked(_lock(path, f"{shard.number}-of-{shard.count}"), DataSetError(refusal), 0.0):
         yield
 
 
@@ -68,7 +68,7 @@ def refuse_shards_at_work(path: Path) -> None:
     """
     for file in sorted(path.parent.glob(_lock(path, "*").name)):
         words = file.name.rsplit("part-", 1)[1].removesuffix(".lock").replace("-of-", "/")
-        refusal = f"generate.path: part {words} of {path} is being made; wait for it, or end it."
+        refusal = f"generate.path: shard {words} of {path} is being made; wait for it, or end it."
         with locked(file, DataSetError(refusal), 0.0):
             pass
 

@@ -105,6 +105,7 @@ def test_numbers_are_checked_alike_as_flags_entries_and_arguments(
         (("register", "--engine", "hybrid"), "--model"),
         (("live", "--engine", "hybrid"), "--model"),
         (("build", "--ramp", "4"), "--load-path"),
+        (("generate", "--part", "0/2"), "--shard"),
     ],
 )
 def test_former_flags_are_refused_with_the_name_of_today(words: tuple[str, ...], now: str) -> None:

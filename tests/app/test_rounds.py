@@ -236,7 +236,7 @@ def test_the_stage_asks_the_network_of_its_round(
     dropped = data.rows(range(first, first + 2)), data.rows(range(first + 4, first + 6))
     for block in (0, first // 2, first // 2 + 2):
         drop_block(copied.data, block)
-    generate_stage(copied.root / "organ.toml", part=part)
+    generate_stage(copied.root / "organ.toml", shard=part)
     assert asked == [0, 0, 1, 1]
     again = DataSet(copied.data)
     assert again.missing_blocks() == []
@@ -301,8 +301,8 @@ def test_a_part_without_torch_says_what_it_does(copied: Workspace, monkeypatch: 
     monkeypatch.setitem(sys.modules, "softtwin.surrogate.train", None)
     data = DataSet(copied.data)
     drop_block(copied.data, data.split_draws("active").start // 2)
-    with pytest.warns(UserWarning, match=r"part 0/1: samples\.rounds: expected torch .* are solved from rest"):
-        made = generate_stage(copied.root / "organ.toml", part=Shard(0, 1))
+    with pytest.warns(UserWarning, match=r"shard 0/1: samples\.rounds: expected torch .* are solved from rest"):
+        made = generate_stage(copied.root / "organ.toml", shard=Shard(0, 1))
     assert made is not None and made.missing_blocks() == []
 
 

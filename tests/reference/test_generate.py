@@ -42,8 +42,8 @@ from softtwin.reference.data.shard import Shard
 from softtwin.reference.data.samplers import LoadPlan
 plan = Plan(loads=LoadPlan(modes=6, displacement=0.08), block=3, seed=5,
             samples={"train": 9, "validation": 3, "test": 4, "calibration": 2})
-part = Shard.parse(sys.argv[2]) if len(sys.argv) > 2 else None
-generate(sys.argv[1], beam((6, 2, 2), (0.6, 0.2, 0.2), "hexahedron"), plan, part=part)
+shard = Shard.parse(sys.argv[2]) if len(sys.argv) > 2 else None
+generate(sys.argv[1], beam((6, 2, 2), (0.6, 0.2, 0.2), "hexahedron"), plan, shard=shard)
 """
 
 
@@ -277,13 +277,13 @@ def test_parts_that_know_nothing_of_each_other_make_the_same_data(
 def test_what_a_part_left_out_is_told_and_made_again(undisturbed: DataSet, tmp_path: Path) -> None:
     path = tmp_path / "data.zarr"
     for number in (0, 2):
-        generate(path, body(), PLAN, part=Shard(number, 3))
+        generate(path, body(), PLAN, shard=Shard(number, 3))
     there = DataSet(path)
     assert there.missing_blocks() == list(range(1, there.block_count, 3))
     with pytest.raises(DataSetError, match=r"block 1 of .* was never finished; run `softtwin generate` again"):
         there.samples("train")
     drop_block(path, 0)
-    generate(path, body(), PLAN, part=Shard(1, 3))
+    generate(path, body(), PLAN, shard=Shard(1, 3))
     assert DataSet(path).missing_blocks() == [0]
     assert_same(undisturbed, generate(path, body(), PLAN))
 
@@ -292,24 +292,24 @@ def test_a_part_is_written_once_at_a_time(undisturbed: DataSet, tmp_path: Path) 
     path = tmp_path / "data.zarr"
     shutil.copytree(undisturbed.path, path)
     with at_work_on(path, Shard(3, 16)):
-        with pytest.raises(DataSetError, match=r"another `generate` is at work on part 3/16"):
-            generate(path, body(), PLAN, part=Shard(3, 16))
-        with pytest.raises(DataSetError, match=r"part 3/16 of .*data\.zarr is being made; wait for it"):
+        with pytest.raises(DataSetError, match=r"another `generate` is at work on shard 3/16"):
+            generate(path, body(), PLAN, shard=Shard(3, 16))
+        with pytest.raises(DataSetError, match=r"shard 3/16 of .*data\.zarr is being made; wait for it"):
             generate(path, body(), PLAN)
-        generate(path, body(), PLAN, part=Shard(4, 16))
+        generate(path, body(), PLAN, shard=Shard(4, 16))
     assert_same(undisturbed, generate(path, body(), PLAN))
 
 
 @pytest.mark.parametrize("words", ["3", "a/b", "-1/4", "4/4", "0/0", "1/2/3", ""])
 def test_parts_that_are_none_are_refused(words: str) -> None:
-    with pytest.raises(DataSetError, match=r"part: expected NUMBER/COUNT like 3/16|Shard\.number: expected 0\.\."):
+    with pytest.raises(DataSetError, match=r"shard: expected NUMBER/COUNT like 3/16|Shard\.number: expected 0\.\."):
         Shard.parse(words)
 
 
 @pytest.mark.parametrize("others", [{"redo": [0]}, {"again": True}])
 def test_a_part_throws_nothing_away(undisturbed: DataSet, others: dict) -> None:
-    with pytest.raises(DataSetError, match=r"generate\.part: expected no blocks to redo and nothing to throw away"):
-        generate(undisturbed.path, body(), PLAN, part=Shard(0, 2), **others)
+    with pytest.raises(DataSetError, match=r"generate\.shard: expected no blocks to redo and nothing to throw away"):
+        generate(undisturbed.path, body(), PLAN, shard=Shard(0, 2), **others)
 
 
 # ---------------------------------------------------------------------- Sobol draws
@@ -325,7 +325,7 @@ def test_sobol_draws_are_even_and_leave_what_is_held_out_alone(undisturbed: Data
     chance = np.random.default_rng(0).random(points.shape)
     assert points.shape == (128, 1 + 9 + 1) and points.min() >= 0.0 and points.max() < 1.0
     assert qmc.discrepancy(points) < 0.5 * qmc.discrepancy(chance)
-    again = generate(tmp_path / "again.zarr", body(), plan, part=Shard(1, 3))
+    again = generate(tmp_path / "again.zarr", body(), plan, shard=Shard(1, 3))
     assert again is not None
     assert_same(made, generate(tmp_path / "again.zarr", body(), plan))
     with pytest.raises(DataSetError, match=r"differs in loads\.sequence \(None there, sobol here\)"):
