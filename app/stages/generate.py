@@ -37,8 +37,8 @@ def generate_stage(
         configuration: the configuration file, read on rank 0 alone.
         redo: numbers of blocks to make again.
         again: throw away what is there.
-        shard: solve the blocks of one shard alone, and of active rounds what they have chosen already; what is missing in
-            the end, further rounds and the Jacobians, the whole stage makes.
+        shard: solve the blocks of one shard alone, and of active rounds what they have chosen already; what is missing
+            in the end, further rounds and the Jacobians, the whole stage makes.
 
     Raises:
         CalibrationError: active rounds are wanted of a material whose residual torch does not know.
