@@ -48,6 +48,7 @@ BENCHMARK = Benchmark(
     name="laws",
     title="How far apart the two Neo-Hookean laws bend the thesis's beam",
     about=("reference",),
+    rows=("modal loads",),
     work=work,
     columns=(
         Column("apart, median", "%", "{relative_difference.median*100:.3f}"),
