@@ -31,6 +31,7 @@ from softtwin.meshes.files import (
     Axes,
     FileError,
     Unit,
+    Volume,
     is_segmentation,
     read_cloud,
     read_mesh,
@@ -77,6 +78,7 @@ class _Reader:
     unit: Unit
     axes: Axes | None
     scan: Scan | None = None
+    numbers: Ints | None = None  # of the body's nodes in its file; None where they are the body's
 
     def options(self, file: File) -> tuple[Path, Unit, Axes]:
         """Path, unit and axes to read a file with; one that says none has those of the source."""
@@ -112,8 +114,8 @@ def make_organ(section: BodySection, root: Path) -> Organ:
         if scan is None:
             _check_stated(section, root)
         reader = _Reader(root, section.unit, files_axes(section), scan)
-        points, cells, notes = _solid(section, reader, source)
-        body = Body(points, cells, {})
+        solid, notes = _solid(section, reader, source)
+        body, reader = Body(solid.points, solid.cells, {}), replace(reader, numbers=solid.numbers)
         notes += [f"axes: {reader.axes.upper()}, inside LPS" if reader.axes else "axes: none said, nothing turned"]
     for name, text in section.inner.items():
         surface, said = _inner(name, text, reader)
@@ -228,23 +230,24 @@ def _shape_options(section: BodySection) -> dict[str, float]:
     return {"cell_size": section.cell_size} if section.cell_size > 0.0 and section.source != "beam" else {}
 
 
-def _solid(section: BodySection, reader: _Reader, source: File) -> tuple[Floats, Ints, list[str]]:
-    found: Surface | tuple[Floats, Ints]
+def _solid(section: BodySection, reader: _Reader, source: File) -> tuple[Volume, list[str]]:
+    found: Surface | Volume
     if reader.scan is not None:
         found, said = reader.scan.surface()
     else:
         found, said = read_mesh(*reader.options(source)), []
-    points = found.points if isinstance(found, Surface) else found[0]
-    _check_size(reader.root / source.path, float(np.ptp(points, axis=0).max()), source.unit or section.unit)
+    size = float(np.ptp(found.points, axis=0).max())
+    _check_size(reader.root / source.path, size, source.unit or section.unit)
     if not isinstance(found, Surface):
-        return *found, []
+        return found, list(found.said)
     if reader.scan is not None:
         reader.scan.check_touching(found, section.cell_size or _LONG * float(np.cbrt(found.volume / section.nodes)))
     if section.cell_size > 0.0:
         solid = solidify(found, cell_size=section.cell_size)
     else:
         solid = solidify(found, node_count=section.nodes)
-    return solid.points, solid.cells, said + str(solid.mending).splitlines()
+    made = Volume(solid.points, solid.cells, np.arange(len(solid.points)))
+    return made, said + str(solid.mending).splitlines()
 
 
 def _check_size(path: Path, size: float, unit: Unit) -> None:
@@ -312,12 +315,13 @@ def _nodes_of_file(body: Body, name: str, file: File, near: float, reader: _Read
     path, unit, axes = reader.options(file)
     numbers = _read_numbers(path)
     if numbers is not None:
-        if numbers.size and (numbers.min() < 0 or numbers.max() >= len(body.points)):
+        known = np.arange(len(body.points)) if reader.numbers is None else reader.numbers
+        if (unknown := np.setdiff1d(numbers, known)).size:
             raise BodyError(
-                f"{name}: expected node numbers in 0..{len(body.points) - 1}, "
-                f"got {numbers.min()}..{numbers.max()} in {path}."
+                f"{name}: expected node numbers in 0..{known[-1]} that belong to cells, "
+                f"got {numbers.min()}..{numbers.max()} in {path}, of which {len(unknown)} do not, first {unknown[0]}."
             )
-        return np.unique(numbers)
+        return np.searchsorted(known, np.unique(numbers))
     distances, _ = cKDTree(read_cloud(path, unit, axes)).query(body.points[body.boundary_nodes])
     nodes = body.boundary_nodes[distances <= near]
     if len(nodes) == 0:

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import Axes, ContentError, FileError, Unit, read_cloud
+from softtwin.meshes.files import Axes, ContentError, FileError, Unit, is_companion, read_cloud
 from softtwin.registration.pose import Pose, read_matrix
 from softtwin.registration.priors import PosePrior
 
@@ -90,11 +90,12 @@ def _files_of(name: str) -> list[Path]:
     if path.is_file():
         return [path]
     if path.is_dir():
-        found = [file for file in path.iterdir() if file.suffix.lower() in CLOUDS]
+        found = [file for file in path.iterdir() if file.suffix.lower() in CLOUDS and not is_companion(file)]
         if not found:
             raise FileError(f"{path}: expected clouds in this folder ({', '.join(CLOUDS)}), found none.")
     elif glob.has_magic(name):
-        found = [Path(file) for file in glob.glob(name, recursive=True) if Path(file).is_file()]
+        found = [Path(file) for file in glob.glob(name, recursive=True)]
+        found = [file for file in found if file.is_file() and not is_companion(file)]
         if not found:
             raise FileError(f"{name}: expected a pattern of files, found none that matches.")
     else:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softtwin.meshes.clouds import CloudError
+from softtwin.meshes.files import is_companion
 
 from .register import CLOUDS, CloudFile, by_numbers
 
@@ -181,7 +182,7 @@ class WatchedFolder:
         except OSError:  # the folder is not there, or not now
             return found
         for path in paths:
-            if path.suffix.lower() not in CLOUDS or path in given or path.name.startswith("."):
+            if path.suffix.lower() not in CLOUDS or path in given or is_companion(path):
                 continue
             try:
                 status = path.stat()

@@ -20,6 +20,7 @@ from typing import Any, Literal
 
 RESULTS = Path(__file__).parent / "results"
 PAGES = Path(__file__).parents[1] / "docs" / "results"
+_SHORT = {"AMD EPYC": "EPYC", "Intel(R) Xeon(R) Processor": "Xeon"}
 Chapter = Literal["reference", "surrogates", "registration", "organs", "live", "data"]
 CHAPTERS: dict[Chapter, str] = {
     "reference": "The reference",
@@ -97,9 +98,9 @@ def _at(figures: Any, way: Way) -> float:
 
 
 def made(row: Row) -> str:
-    """Commit and day of a row's record; where rows carry their own, the row's."""
+    """Commit, day and processor of a row's record; where rows carry their own, the row's."""
     record = load(row.record)
-    told: dict[str, Any] = {"commit": record.get("commit"), "date": record.get("date", "")}
+    told: dict[str, Any] = {"commit": record.get("commit"), "date": record.get("date", ""), "on": processor(record)}
     figures = record["figures"]
     for place in (record.get("made", {}), figures if isinstance(figures, dict) else {}):
         one = place.get(row.way[0]) if isinstance(place, dict) else None
@@ -107,8 +108,15 @@ def made(row: Row) -> str:
             told |= {name: one[name] for name in told if name in one}
             own = one.get("made")
             told |= {name: own[name] for name in told if isinstance(own, dict) and name in own}
-    commit = told["commit"] or "no commit"
-    return f"{commit}, {told['date']}"
+    words = [told["commit"] or "no commit", told["date"], _SHORT.get(told["on"], told["on"])]
+    return ", ".join(word for word in words if word)
+
+
+def processor(record: dict[str, Any]) -> str:
+    """What a record's figures were made on: the accelerator, else the processor; empty where it does not say."""
+    machine = record.get("machine") or {}
+    gpu = machine.get("gpu", "none")
+    return str(machine.get("processor", "") if gpu == "none" else gpu)
 
 
 def shown(value: float, digits: int) -> str:

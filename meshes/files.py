@@ -19,12 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkPoints, vtkStringArray, vtkStringOutputWindow
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkGenericCell, vtkUnstructuredGrid
 from vtkmodules.vtkFiltersCore import vtkTriangleFilter
 from vtkmodules.vtkIOLegacy import vtkDataSetReader
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader, vtkXMLUnstructuredGridWriter
 
-from .body import Body, Floats, Ints, Surface, corner_jacobians
+from .body import Body, Floats, Ints, Surface
+from .cells import CellError, counted, dimension, one_kind, other_cell
 from .elements import KINDS
 from .ply import read_ply, read_ply_normals
 
@@ -38,12 +39,28 @@ _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 LARGEST, SMALLEST = 2.0, 5e-3  # metres: an organ outside these was read in the wrong unit
 _MESHIO = (".stl", ".obj", ".msh")
 _VTK: Mapping[str, Any] = {".vtk": vtkDataSetReader, ".vtu": vtkXMLUnstructuredGridReader, ".vtp": vtkXMLPolyDataReader}
-_FIRST_MSH = {1: "line", 2: "triangle", 3: "quad", 4: "tetra", 5: "hexahedron", 15: "vertex"}  # gmsh's element types
+_FIRST_MSH = {
+    1: "line",
+    2: "triangle",
+    3: "quad",
+    4: "tetra",
+    5: "hexahedron",
+    6: "wedge",
+    7: "pyramid",
+    8: "line3",
+    15: "vertex",
+}  # gmsh's element types
+_FIRST_MSH_SURFACES = (9, 10, 16)
 _TEXT = (".txt", ".csv", ".xyz")
 SEGMENTATIONS = (".nii", ".nii.gz", ".nrrd")
 _PCD = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
 _TURN = np.array([-1.0, -1.0, 1.0])  # from RAS to LPS and back
-_VTK_NODES = {kind.vtk: (kind.name, kind.nodes) for kind in KINDS.values()}
+_VTK_NAMES = {kind.vtk: kind.name for kind in KINDS.values()} | {
+    **{1: "vertex", 2: "vertex group", 3: "line", 4: "line string", 21: "line3"},
+    **{6: "triangle strip", 7: "polygon", 8: "pixel", 23: "quad8"},
+    **{11: "voxel", 13: "wedge", 14: "pyramid", 42: "polyhedron"},
+    **{25: "hexahedron20", 26: "wedge15", 27: "pyramid13", 32: "wedge18", 33: "hexahedron24"},
+}
 _LAST_LINES = 100  # of a text cloud, to see how its numbers end
 _HEAD = 2048  # bytes in which a file says what it is
 _FRACTIONS = "fraction"
@@ -79,8 +96,29 @@ class _Mesh:
 
     @property
     def content(self) -> str:
-        counts = [f"{len(block)} {name}" for name, block in self.cells.items() if name != "vertex"]
-        return f"{len(self.points)} points" + (f" and cells: {', '.join(counts)}" if counts else " and no cells")
+        counts = counted({name: block for name, block in self.cells.items() if name != "vertex"})
+        return f"{len(self.points)} points" + (f" and cells: {counts}" if counts else " and no cells")
+
+    @property
+    def is_solid(self) -> bool:
+        return any(dimension(name) == 3 for name in self.cells)
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """A volume mesh as a file holds it.
+
+    Args:
+        points: (n, 3), metres, LPS: the nodes of its cells.
+        cells: (m, 4), (m, 8), (m, 10) or (m, 27) node numbers.
+        numbers: (n,) the nodes' numbers in the file, from 0; nodes of no cell are left out.
+        said: what was done to it, one line each.
+    """
+
+    points: Floats
+    cells: Ints
+    numbers: Ints
+    said: tuple[str, ...] = ()
 
 
 def in_metres(lengths: ArrayLike, unit: Unit) -> Floats:
@@ -112,13 +150,24 @@ def is_segmentation(path: str | Path) -> bool:
     return bool(structure_files(path)) if Path(path).is_dir() else is_labelmap(path)
 
 
+def is_companion(path: str | Path) -> bool:
+    """Whether a file is what a system or an editor left beside another, and no data: hidden, a lock, of `__MACOSX`.
+
+    Args:
+        path: a file that was found in a folder.
+    """
+    path = Path(path)
+    return path.name.startswith((".", "~$")) or "__MACOSX" in path.parts
+
+
 def structure_files(folder: str | Path) -> list[Path]:
     """The label maps in a folder, in order.
 
     Args:
         folder: as TotalSegmentator writes it, with a file for each structure.
     """
-    return sorted(path for path in Path(folder).iterdir() if path.is_file() and is_labelmap(path))
+    files = (path for path in Path(folder).iterdir() if path.is_file() and not is_companion(path))
+    return sorted(path for path in files if is_labelmap(path))
 
 
 def stated_axes(path: str | Path) -> Axes | None:
@@ -162,8 +211,8 @@ def _stated(path: Path, name: str) -> str:
     return str(array.GetValue(0)) if array and array.IsA("vtkStringArray") and array.GetNumberOfValues() else ""
 
 
-def read_mesh(path: str | Path, unit: Unit | None = None, axes: Axes | None = None) -> Surface | tuple[Floats, Ints]:
-    """What a mesh file holds: points and cells where it has tetrahedra or hexahedra, else a surface.
+def read_mesh(path: str | Path, unit: Unit | None = None, axes: Axes | None = None) -> Surface | Volume:
+    """What a mesh file holds: a volume where it has volume cells (surfaces beside them are ignored), else a surface.
 
     Args:
         path: STL, PLY, OBJ, VTK, VTU, VTP or MSH file.
@@ -175,7 +224,7 @@ def read_mesh(path: str | Path, unit: Unit | None = None, axes: Axes | None = No
         FileError: as `read_surface`.
     """
     mesh = _read(path)
-    if {"tetra", "hexahedron"} & set(mesh.cells):
+    if mesh.is_solid:
         return _volume(Path(path), mesh, *_known(path, unit, axes))
     return _surface(Path(path), mesh, *_known(path, unit, axes))
 
@@ -196,18 +245,22 @@ def read_surface(path: str | Path, unit: Unit | None = None, axes: Axes | None =
 
 
 def read_volume(path: str | Path, unit: Unit | None = None, axes: Axes | None = None) -> tuple[Floats, Ints]:
-    """Points (n, 3) in metres and cells (m, 4) or (m, 8) of a volume mesh, the file's node numbers kept.
+    """Points (n, 3) in metres and cells of a volume mesh, all of one kind; nodes of no cell are left out.
 
     Args:
-        path: VTK, VTU or MSH file with tetrahedra or hexahedra (not both); triangles beside them are ignored.
+        path: VTK, VTU or MSH file with tetrahedra, hexahedra, voxels, wedges or pyramids (a mixture becomes
+            tetrahedra), or tetra10 or hexahedron27 alone; triangles beside them are ignored.
         unit: the file's unit of length; what the file states if not given, else metres.
         axes: the file's axes: `lps` is kept, `ras` is turned to LPS (x and y change sign); what the file states if not
             given, else LPS.
 
     Raises:
-        FileError: missing, empty, damaged or unknown file, a surface only, or both kinds of cells.
+        FileError: missing, empty, damaged or unknown file, a surface only, or cells that cannot be read.
     """
-    return _volume(Path(path), _read(path), *_known(path, unit, axes))
+    volume = _volume(Path(path), _read(path), *_known(path, unit, axes))
+    for line in volume.said:
+        _log.info("%s: %s", path, line)
+    return volume.points, volume.cells
 
 
 def read_cloud(path: str | Path, unit: Unit = "m", axes: Axes = "lps", normals: bool = False) -> Floats:
@@ -487,7 +540,8 @@ def _from_first_msh(path: Path) -> _Mesh:
         for _ in range(int(words[elements + 1])):
             kind, size = int(words[at + 1]), int(words[at + 4])
             corners = [int(word) for word in words[at + 5 : at + 5 + size]]
-            cells.setdefault(_FIRST_MSH.get(kind, f"MSH type {kind}"), []).append(corners)
+            other = other_cell(2 if kind in _FIRST_MSH_SURFACES else 3, f"MSH type {kind}")
+            cells.setdefault(_FIRST_MSH.get(kind, other), []).append(corners)
             at += 5 + size
         numbers = table[:, 0].astype(np.int64)
         order = np.argsort(numbers)
@@ -586,8 +640,13 @@ def _grid_blocks(grid: Any) -> dict[str, Ints]:
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     blocks = {}
     for kind in np.unique(types):
-        name, corners = _VTK_NODES.get(int(kind), (f"VTK type {kind}", 1))
-        blocks[name] = connectivity[starts[types == kind][:, None] + np.arange(corners)]
+        of_kind = types == kind
+        name, nodes = _VTK_NAMES.get(int(kind), ""), int(sizes[of_kind].min())
+        if not name:
+            cell = vtkGenericCell()
+            cell.SetCellType(int(kind))
+            name = other_cell(cell.GetCellDimension(), f"VTK type {kind}")
+        blocks[name] = connectivity[starts[of_kind][:, None] + np.arange(nodes)]
     return blocks
 
 
@@ -639,7 +698,7 @@ def _is_numeric(line: str) -> bool:
 
 def _surface(path: Path, mesh: _Mesh, unit: Unit, axes: Axes) -> Surface:
     triangles = mesh.triangles
-    if len(triangles) == 0:
+    if len(triangles) == 0 or any(dimension(name) == 2 for name in set(mesh.cells) - {"triangle", "quad"}):
         raise FileError(f"{path}: expected a surface of triangles, got {mesh.content}.")
     points = mesh.points
     places, numbers = np.unique(points, axis=0, return_inverse=True)
@@ -651,22 +710,19 @@ def _surface(path: Path, mesh: _Mesh, unit: Unit, axes: Axes) -> Surface:
     return Surface(points, numbers.reshape(-1, 3).astype(np.int64))
 
 
-def _volume(path: Path, mesh: _Mesh, unit: Unit, axes: Axes) -> tuple[Floats, Ints]:
-    kinds = [kind for kind in ("tetra", "hexahedron") if kind in mesh.cells]
-    if not kinds:
+def _volume(path: Path, mesh: _Mesh, unit: Unit, axes: Axes) -> Volume:
+    if not mesh.is_solid:
         advice = "; a surface must be made solid first (softtwin build does it)" if len(mesh.triangles) else ""
         raise FileError(f"{path}: expected a volume mesh of tetrahedra or hexahedra, got {mesh.content}{advice}.")
-    if len(kinds) == 2:
-        raise FileError(f"{path}: expected one kind of cells, got {mesh.content}.")
-    points = _placed(path, mesh.points, unit, axes, smallest=SMALLEST)
-    return points, _turned(path, points, mesh.cells[kinds[0]])
-
-
-def _turned(path: Path, points: Floats, cells: Ints) -> Ints:
-    if (corner_jacobians(points, cells) >= 0).any():
-        return cells
-    _log.info("%s: all %d cells were inside out and have been turned", path, len(cells))
-    return cells[:, [0, 2, 1, 3]] if cells.shape[1] == 4 else cells[:, [4, 5, 6, 7, 0, 1, 2, 3]]
+    try:
+        cells, said = one_kind(mesh.points, mesh.cells)
+    except CellError as error:
+        raise FileError(f"{path}: {error}.") from error
+    numbers, local = np.unique(cells, return_inverse=True)
+    if left := len(mesh.points) - len(numbers):
+        said.append(f"nodes: {left} of {len(mesh.points)} belong to no volume cell and were left out")
+    points = _placed(path, mesh.points[numbers], unit, axes, smallest=SMALLEST)
+    return Volume(points, local.reshape(cells.shape).astype(np.int64), numbers, tuple(said))
 
 
 def _placed(path: Path, points: Floats, unit: Unit, axes: Axes, smallest: float) -> Floats:

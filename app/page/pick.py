@@ -71,7 +71,7 @@ def subject_of(section: BodySection, root: Path, configuration: Path | None = No
     file = parse_file(section.source)
     unit = file.unit or section.unit
     found = read_mesh(root / file.path, unit, axes or "lps")
-    surface = found if isinstance(found, Surface) else Body(*found, {}).boundary_surface
+    surface = found if isinstance(found, Surface) else Body(found.points, found.cells, {}).boundary_surface
     inner = {}
     for name, text in section.inner.items():
         part = parse_file(text)

@@ -234,6 +234,19 @@ def test_node_numbers_still_work(files: Path, tmp_path: Path) -> None:
         assert np.array_equal(make(files, fixed=str(tmp_path / name)).fixed, fixed)
 
 
+def test_node_numbers_are_those_of_the_file_where_some_of_its_nodes_are_left_out(files: Path, tmp_path: Path) -> None:
+    mesh, fixed = meshio.read(files / "organ.vtu"), make(files).fixed
+    points = np.concatenate([[[1e3, 0, 0]], mesh.points, [[0, 1e3, 0]]])
+    meshio.Mesh(points, [("tetra", mesh.cells_dict["tetra"] + 1)]).write(tmp_path / "stray.vtu")
+    np.savetxt(tmp_path / "fixed.txt", fixed + 1, fmt="%d")
+    made = make_organ(section(files, source=str(tmp_path / "stray.vtu"), fixed=str(tmp_path / "fixed.txt")), files)
+    assert np.array_equal(made.body.fixed, fixed) and np.array_equal(made.body.points, make(files).points)
+    assert any(note.startswith(f"nodes: 2 of {len(points)} belong to no volume cell") for note in made.notes)
+    np.savetxt(tmp_path / "fixed.txt", [*(fixed + 1), 0], fmt="%d")
+    with pytest.raises(BodyError, match=r"that belong to cells, got 0\.\.[0-9]+ in .* of which 1 do not, first 0"):
+        make(files, source=str(tmp_path / "stray.vtu"), fixed=str(tmp_path / "fixed.txt"))
+
+
 def test_lone_listed_nodes_are_not_an_attachment() -> None:
     """An attachment is a surface: a listed node without a whole listed triangle is left free."""
     bare = beam((6, 2, 2), (0.6, 0.2, 0.2), "tetrahedron")

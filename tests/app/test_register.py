@@ -61,9 +61,13 @@ def test_folders_and_patterns_are_read_by_number(tmp_path: Path) -> None:
     for number in (1, 2, 10):
         np.save(tmp_path / f"cloud_{number}.npy", np.eye(3))
     (tmp_path / "notes.md").write_text("not a cloud")
+    (tmp_path / "__MACOSX").mkdir()
+    for companion in ("._cloud_1.npy", ".~lock.npy", "~$cloud_1.npy", "__MACOSX/cloud_1.npy"):
+        (tmp_path / companion).write_bytes(b"Mac OS X        ")
     wanted = ["cloud_1.npy", "cloud_2.npy", "cloud_10.npy"]
     assert names(find_clouds([tmp_path], METRES)) == wanted
     assert names(find_clouds([f"{tmp_path}/cl*.npy"], METRES)) == wanted
+    assert names(find_clouds([f"{tmp_path}/**/*.npy"], METRES)) == wanted
     given = [tmp_path / "cloud_10.npy", tmp_path / "cloud_1.npy"]
     assert names(find_clouds(given, METRES)) == ["cloud_10.npy", "cloud_1.npy"]  # as they were given
 

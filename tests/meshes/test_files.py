@@ -10,6 +10,7 @@ from softtwin.meshes.body import Body, BodyError, Surface
 from softtwin.meshes.files import (
     FileError,
     UnitWarning,
+    Volume,
     read_body,
     read_cloud,
     read_mesh,
@@ -109,7 +110,8 @@ def test_a_volume_mesh_comes_back_exactly(suffix: str, kind: str, tmp_path: Path
     meshio.Mesh(body.points, [("triangle", body.boundary), (name, body.cells)]).write(tmp_path / f"beam{suffix}")
     points, cells = read_volume(tmp_path / f"beam{suffix}")
     assert points.tobytes() == body.points.tobytes() and np.array_equal(cells, body.cells)
-    assert isinstance(read_mesh(tmp_path / f"beam{suffix}"), tuple)
+    volume = read_mesh(tmp_path / f"beam{suffix}")
+    assert isinstance(volume, Volume) and volume.said == () and np.array_equal(volume.numbers, range(len(points)))
 
 
 def test_read_mesh_gives_a_surface_where_there_is_no_volume(tmp_path: Path, ball: Surface) -> None:
@@ -138,14 +140,15 @@ def test_some_inverted_tetrahedra_are_left_for_the_body_to_refuse(tmp_path: Path
         Body(*read_volume(tmp_path / "beam.vtk"), body.node_sets)
 
 
-def test_stray_nodes_keep_the_numbering_and_are_left_for_the_body_to_refuse(tmp_path: Path) -> None:
+def test_nodes_of_no_cell_are_left_out_and_counted(tmp_path: Path) -> None:
     body = beam((3, 2, 2), kind="tetrahedron")
     points = np.concatenate([[[9.0, 9.0, 9.0]], body.points])
     meshio.Mesh(points * 0.1, [("tetra", body.cells + 1)]).write(tmp_path / "beam.vtk")
-    read = read_volume(tmp_path / "beam.vtk")
-    assert np.array_equal(read[1], body.cells + 1)
-    with pytest.raises(BodyError, match="got 1 stray nodes"):
-        Body(*read, {"fixed": [1, 2, 3]})
+    read = read_mesh(tmp_path / "beam.vtk")
+    assert isinstance(read, Volume) and np.array_equal(read.cells, body.cells)
+    assert np.array_equal(read.numbers, np.arange(len(body.points)) + 1)
+    assert read.said == (f"nodes: 1 of {len(points)} belong to no volume cell and were left out",)
+    assert np.array_equal(read_volume(tmp_path / "beam.vtk")[0], 0.1 * body.points)
 
 
 def test_a_surface_where_a_volume_is_wanted_is_refused(tmp_path: Path, ball: Surface) -> None:

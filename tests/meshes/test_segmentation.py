@@ -117,6 +117,8 @@ def test_a_folder_of_files_is_a_segmentation_and_segments_make_a_liver(tmp_path:
         half = grid.label(lambda x, side=side: np.maximum(ORGAN(x), side * (x[..., 0] - MIDDLE[0])))
         write_nifti(tmp_path / f"liver_segment_{number}.nii.gz", grid, half)
     write_nifti(tmp_path / "portal_vein_and_splenic_vein.nii.gz", grid, grid.label(CAVA))
+    for companion in ("._liver.nii.gz", ".liver.nii.gz", "~$liver.nii.gz"):
+        (tmp_path / companion).write_bytes(b"Mac OS X        ")  # beside the files of a folder that was copied
     assert is_segmentation(tmp_path)
     segmentation = read_segmentation(tmp_path)
     surface, notes = organ_surface(segmentation, the_organ(segmentation))
