@@ -12,6 +12,7 @@ from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
 from vtkmodules.vtkFiltersGeneral import vtkDataSetTriangleFilter
 
 from .body import Floats, Ints, corner_jacobians
+from .elements import KINDS
 
 _SOLID = ("tetra", "hexahedron", "wedge", "pyramid", "voxel", "polyhedron", "VTK_LAGRANGE_TETRA", "VTK_LAGRANGE_HEXA",
           "VTK_LAGRANGE_WEDGE")  # fmt: skip
@@ -20,16 +21,15 @@ _VTK_NUMBERS = {"tetra": 10, "hexahedron": 12, "wedge": 13, "pyramid": 14}
 _QUADRATIC = ("tetra10", "hexahedron27")
 _VOXEL = [0, 1, 3, 2, 4, 5, 7, 6]  # nodes of VTK's voxel, which counts along the axes, as those of a hexahedron
 _TURNED = {4: [0, 2, 1, 3], 8: [4, 5, 6, 7, 0, 1, 2, 3], 10: [0, 2, 1, 3, 6, 5, 4, 7, 9, 8]}
-_CORNERS = {10: 4, 27: 8}
 _TRIANGLES = {
-    "tetra": [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
-    "wedge": [[0, 1, 2], [3, 5, 4]],
-    "pyramid": [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]],
+    "tetra": KINDS[3, 4].facets,
+    "wedge": ((0, 1, 2), (3, 5, 4)),
+    "pyramid": ((0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
 }
 _QUADRILATERALS = {
-    "hexahedron": [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]],
-    "wedge": [[0, 3, 4, 1], [1, 4, 5, 2], [2, 5, 3, 0]],
-    "pyramid": [[0, 3, 2, 1]],
+    "hexahedron": KINDS[3, 8].facets,
+    "wedge": ((0, 3, 4, 1), (1, 4, 5, 2), (2, 5, 3, 0)),
+    "pyramid": ((0, 3, 2, 1),),
 }
 _SOURCE = "softtwin: number of the cell"
 
@@ -105,13 +105,13 @@ def one_kind(points: Floats, blocks: Mapping[str, Ints]) -> tuple[Ints, list[str
 
 def _turned(points: Floats, cells: Ints) -> tuple[Ints, list[str]]:
     """Cells that are all inside out the right way round; where some are, the body says which."""
-    corners = cells[:, : _CORNERS.get(cells.shape[1], cells.shape[1])]
+    corners = cells[:, : KINDS[3, cells.shape[1]].corners]
     if cells.shape[1] not in _TURNED or (corner_jacobians(points, corners) >= 0).any():
         return cells, []
     return cells[:, _TURNED[cells.shape[1]]], [f"all {len(cells)} cells were inside out and have been turned"]
 
 
-def _faces(solid: Mapping[str, Ints], corners: Mapping[str, list[list[int]]], count: int) -> Ints:
+def _faces(solid: Mapping[str, Ints], corners: Mapping[str, tuple[tuple[int, ...], ...]], count: int) -> Ints:
     """The faces of that many corners that one cell alone has, with sorted nodes."""
     parts = [block[:, np.array(corners[name])].reshape(-1, count) for name, block in solid.items() if name in corners]
     faces, times = np.unique(

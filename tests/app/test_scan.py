@@ -139,10 +139,15 @@ def test_the_real_liver_comes_back_from_flat_voxels(liver_folder: Path, tmp_path
     picked = points[fixed[0]]
     held = f"ball:{','.join(f'{1e3 * x:.2f}' for x in picked * (-1, -1, 1))}:20mm"
     section = {"source": "liver.nii.gz:ras", "unit": "mm", "nodes": 1200, "fixed": held}
-    body = make_organ(parse_config({"body": section}).body, tmp_path).body
-    assert body.volume == pytest.approx(truth.volume, rel=0.02)  # flat faces between nodes cost a little
-    made = pyvista.PolyData(1e3 * body.points[body.boundary_nodes])
-    away = np.abs(made.compute_implicit_distance(surface)["implicit_distance"])
-    # fTetWild meshes differently each time: the worst node of some 760 is 1.6 to 2.6 mm off, 99 % are within 1.3 mm.
-    assert away.mean() < 0.5 and np.quantile(away, 0.99) < 1.6 and away.max() < 5.0  # two slices
+    worst = []
+    for _ in range(3):  # fTetWild meshes differently each time: where one node is too far off, two more have to be near
+        body = make_organ(parse_config({"body": section}).body, tmp_path).body
+        assert body.volume == pytest.approx(truth.volume, rel=0.02)  # flat faces between nodes cost a little
+        made = pyvista.PolyData(1e3 * body.points[body.boundary_nodes])
+        away = np.abs(made.compute_implicit_distance(surface)["implicit_distance"])
+        assert away.mean() < 0.5 and np.quantile(away, 0.99) < 1.6
+        worst.append(away.max())
+        if worst[0] < 2.5:
+            break
+    assert np.median(worst) < 2.5
     assert len(body.fixed) > 5 and np.linalg.norm(body.points[body.fixed] - picked, axis=1).max() < 0.02
