@@ -12,6 +12,7 @@ import numpy as np
 
 from .body import Floats, Ints, Surface
 from .checks import SurfaceError, checked_surface
+from .signals import restore_sigpipe
 
 _GMSH_LOCK = threading.RLock()  # gmsh has one global state
 _TETRAHEDRON, _TRIANGLE = 4, 2  # gmsh's element types
@@ -37,6 +38,7 @@ def gmsh_model(name: str) -> Iterator[Any]:
     with _GMSH_LOCK:
         # Without interruptible=False gmsh takes over Ctrl-C, which fails outside the main thread.
         gmsh.initialize(["-nopopup"], readConfigFiles=False, interruptible=False)
+        restore_sigpipe()
         try:
             gmsh.option.setNumber("General.Terminal", 0)
             gmsh.option.setNumber("General.NumThreads", 1)
@@ -45,6 +47,7 @@ def gmsh_model(name: str) -> Iterator[Any]:
             yield gmsh
         finally:
             gmsh.finalize()
+            restore_sigpipe()
 
 
 def filled(surface: Surface, size: float) -> tuple[Floats, Ints]:

@@ -37,6 +37,9 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from softtwin.meshes.elements import Kind
+from softtwin.meshes.signals import restore_sigpipe
+
+restore_sigpipe()  # PETSc took it where somebody imported DOLFINx before
 
 if warnings.showwarning is not _SHOWN:  # FFCx 0.5 turns all of Python's warnings into lines of its log
     logging.captureWarnings(False)
