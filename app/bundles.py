@@ -21,7 +21,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLPolyDataWriter
 
 from softtwin.meshes.export import PER_METRE, Coordinates
-from softtwin.meshes.files import FileError, add_words, discard
+from softtwin.meshes.io import FileError, add_words, discard
 
 _VERSION = "Slicer5.6.0"  # whose way of writing scenes this is
 _LENGTHS = "displacement"  # an array that is a length

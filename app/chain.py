@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.files import read_body
+from softtwin.meshes.io import read_body
 from softtwin.reference.data.dataset import DataSet, DataSetError, differences
 from softtwin.reference.data.samplers import check_loads
 from softtwin.surrogate.checkpoint import CheckpointError

@@ -15,7 +15,7 @@ import click
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.attachment import File, parse_file, parse_regions
-from softtwin.meshes.files import Axes, Unit, is_segmentation, stated_axes, stated_unit
+from softtwin.meshes.io import Axes, Unit, is_segmentation, stated_axes, stated_unit
 from softtwin.reference.ranks import FailedElsewhere
 
 from .arguments import (
@@ -235,7 +235,7 @@ def model_error(configuration: Path) -> None:
 @flags(ExportArguments)
 def export(twin: Path, output: Path | None, directions: int) -> None:
     """Write the surrogate of TWIN as graphs for other programs (ONNX and torch.export): displacement and Jacobian."""
-    from softtwin.meshes.files import read_body
+    from softtwin.meshes.io import read_body
     from softtwin.surrogate.export import export as write_graphs
     from softtwin.surrogate.twin import load
 

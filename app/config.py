@@ -10,7 +10,7 @@ import tomlkit
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from softtwin.meshes.attachment import parse_file
-from softtwin.meshes.files import SEGMENTATIONS, Axes
+from softtwin.meshes.io import SEGMENTATIONS, Axes
 
 from .parameters import WORDS as PARAMETERS
 from .parameters import NamedParameter

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.files import write_deformed
+from softtwin.meshes.io import write_deformed
 from softtwin.reference.data.dataset import DataSet, DataSetError
 from softtwin.reference.data.schema import Reason
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.embedding import outer
 from softtwin.meshes.export import SURFACE_FORMATS, Coordinates, write_points, write_series, write_surface
-from softtwin.meshes.files import write_deformed
+from softtwin.meshes.io import write_deformed
 from softtwin.registration.result import Registration
 
 from .bundles import Track, write_scene, write_sequence

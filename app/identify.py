@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from softtwin.meshes.files import Unit
+from softtwin.meshes.io import Unit
 from softtwin.registration.parameter_blocks import Estimate
 from softtwin.registration.result import Registration
 

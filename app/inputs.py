@@ -10,7 +10,7 @@ from typing import Any
 
 from softtwin.meshes.attachment import parse_file
 from softtwin.meshes.body import Body
-from softtwin.meshes.files import is_segmentation, read_body, structure_files
+from softtwin.meshes.io import is_segmentation, read_body, structure_files
 from softtwin.reference.data.dataset import DataSet, DataSetError, differences, existing
 from softtwin.reference.data.jacobians import mark
 from softtwin.reference.data.samplers import LoadPlan

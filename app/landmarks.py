@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import FileError
+from softtwin.meshes.io import FileError
 from softtwin.registration.landmarks import LandmarkPairs
 from softtwin.registration.pose import LandmarkFit, from_landmarks, read_landmarks
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softtwin.meshes.files import Axes, Unit
+from softtwin.meshes.io import Axes, Unit
 
 from .address import Address
 from .answer import Answer, Reply

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Surface
 from softtwin.meshes.embedding import Embedding
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import Axes, FileError, discard
+from softtwin.meshes.io import Axes, FileError, discard
 from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Verdict
 

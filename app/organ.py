@@ -25,7 +25,8 @@ from softtwin.meshes.attachment import (
 )
 from softtwin.meshes.body import Body, BodyError, Surface
 from softtwin.meshes.embedding import embed
-from softtwin.meshes.files import (
+from softtwin.meshes.grid import gridded
+from softtwin.meshes.io import (
     LARGEST,
     SMALLEST,
     Axes,
@@ -39,7 +40,6 @@ from softtwin.meshes.files import (
     stated_axes,
     stated_unit,
 )
-from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam, liver_phantom, propeller
 from softtwin.meshes.solidify import solidify
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import target_points
-from softtwin.meshes.files import read_body
+from softtwin.meshes.io import read_body
 from softtwin.registration.result import Registration
 
 from .chain import make_twin, prepare

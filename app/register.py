@@ -19,7 +19,7 @@ from tqdm import tqdm
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import Axes, ContentError, FileError, Unit, is_companion, read_cloud
+from softtwin.meshes.io import Axes, ContentError, FileError, Unit, is_companion, read_cloud
 from softtwin.registration.pose import Pose, read_matrix
 from softtwin.registration.priors import PosePrior
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import Embedding, carried, outer, target_points
-from softtwin.meshes.files import read_body
+from softtwin.meshes.io import read_body
 from softtwin.meshes.metrics import mesh_quality, nodal_errors
 from softtwin.reference.data.dataset import SPLITS, DataSet
 from softtwin.registration.residuals import SurfaceDistance

@@ -10,7 +10,7 @@ import numpy as np
 
 from softtwin.meshes.attachment import File, Region, RegionError, Touching, parse_file
 from softtwin.meshes.body import Floats, Surface
-from softtwin.meshes.files import Axes, Unit
+from softtwin.meshes.io import Axes, Unit
 from softtwin.meshes.segmentation import (
     Segmentation,
     distances_to,

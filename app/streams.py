@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softtwin.meshes.clouds import CloudError
-from softtwin.meshes.files import is_companion
+from softtwin.meshes.io import is_companion
 
 from .register import CLOUDS, CloudFile, by_numbers
 

@@ -18,7 +18,7 @@ from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.embedding import Embedding, outer, target_points
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import read_body
+from softtwin.meshes.io import read_body
 from softtwin.reference.data.discrepancy import Discrepancy, read_discrepancy
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import loaded_nodes

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import outer
-from softtwin.meshes.files import read_mesh
 from softtwin.meshes.grid import gridded
+from softtwin.meshes.io import read_mesh
 from softtwin.meshes.shapes import beam, liver_phantom
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.samplers import LoadPlan, draw_load, loaded_nodes

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from record import LIVER, RUNS
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.files import read_mesh
 from softtwin.meshes.grid import gridded
+from softtwin.meshes.io import read_mesh
 from softtwin.meshes.shapes import beam, propeller
 from softtwin.reference.data.dataset import DataSet, existing
 from softtwin.reference.data.jacobians import missing_jacobians

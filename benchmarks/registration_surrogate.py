@@ -21,7 +21,7 @@ from softtwin.app.config import Config
 from softtwin.app.launch import generate_in_parallel
 from softtwin.app.stages.learn import train_stage, validate_stage
 from softtwin.app.workspace import Workspace
-from softtwin.meshes.files import write_body
+from softtwin.meshes.io import write_body
 from softtwin.registration.options import options_for
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.twin import load

@@ -17,7 +17,7 @@ from columns import Column
 from harness import Benchmark, Given, Setting, run
 
 from softtwin.meshes.body import Body, Surface
-from softtwin.meshes.files import Unit, read_mesh
+from softtwin.meshes.io import Unit, read_mesh
 from softtwin.meshes.metrics import edge_lengths, scaled_jacobians
 from softtwin.meshes.solidify import solidify
 

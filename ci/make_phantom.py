@@ -31,7 +31,7 @@ from softtwin.app.twin import find_twin, forward_models
 from softtwin.app.workspace import Workspace
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.closest import polydata
-from softtwin.meshes.files import read_body, write_body
+from softtwin.meshes.io import read_body, write_body
 from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.calibration import coverage
 from softtwin.surrogate.discrepancy import with_discrepancy

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from .body import Body, Floats, Ints
 from .closest import distances
 from .clouds import triangles_seen_from
-from .files import AXES, UNITS, Axes, Unit, in_metres
+from .io import AXES, UNITS, Axes, Unit, in_metres
 from .metrics import edge_lengths
 
 Vector = tuple[float, float, float]

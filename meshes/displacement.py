@@ -21,7 +21,7 @@ from vtkmodules.vtkFiltersCore import vtkProbeFilter
 from .body import Body, Floats, Surface
 from .closest import closest_points
 from .export import Coordinates
-from .files import FileError, discard, unstructured_grid
+from .io import FileError, discard, unstructured_grid
 
 Direction = Literal["forward", "inverse"]
 VOXELS = 64  # along the organ's longest side, where no spacing is told

@@ -24,7 +24,7 @@ from vtkmodules.vtkIOPLY import vtkPLYWriter
 from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
 from .body import Floats, Ints, Surface
-from .files import Axes, FileError, Unit, add_words, discard, vtk_messages
+from .io import Axes, FileError, Unit, add_words, discard, vtk_messages
 
 SURFACE_FORMATS = ("stl", "ply", "obj", "vtp")
 PER_METRE: Mapping[str, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0}

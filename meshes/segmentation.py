@@ -18,8 +18,8 @@ from scipy.ndimage import find_objects
 from scipy.spatial import cKDTree
 
 from .body import Floats, Surface
-from .files import Axes, FileError, Unit, structure_files
-from .labelmap import LabelMap, read_labelmap, stated_frame
+from .io import Axes, FileError, Unit, structure_files
+from .io.labels import LabelMap, read_labelmap, stated_frame
 from .voxels import Voxels, boxed, facing_share, smooth_surface, solid_part, thick_share, without_crumbs
 
 # One meaning a line; a number behind a name (lesion_2, liver_segment_4) is one of several that are taken together.

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import Embedding, embed
-from softtwin.meshes.files import read_body, write_body
+from softtwin.meshes.io import read_body, write_body
 from softtwin.meshes.solidify import solidify
 
 from .data.dataset import DataSet, Samples

@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from slepc4py import SLEPc
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.files import FileError, read_fields, write_body
+from softtwin.meshes.io import FileError, read_fields, write_body
 
 from .fem.fenicsx import MPI, PETSc
 from .solve.problem import Problem

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from softtwin.meshes.export import PER_METRE
-from softtwin.meshes.files import Axes, FileError, Unit
+from softtwin.meshes.io import Axes, FileError, Unit
 
 Floats = NDArray[np.float64]
 

@@ -36,7 +36,7 @@ class TwinError(ValueError):
 
 
 def save(surrogate: Surrogate, folder: Path | str, single: bool = False) -> None:
-    """Write weights (safetensors) and card (JSON) into a folder; the body is written apart, with `meshes.files`.
+    """Write weights (safetensors) and card (JSON) into a folder; the body is written apart, with `meshes.io`.
 
     Args:
         surrogate: what to save.

@@ -20,7 +20,7 @@ from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.closest import cell_locator
 from softtwin.meshes.embedding import outer
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import read_mesh, read_surface, stated_axes
+from softtwin.meshes.io import read_mesh, read_surface, stated_axes
 
 from ..config import BodySection, ConfigError, files_axes, read_config
 from ..organ import SHAPES, make_body

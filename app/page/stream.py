@@ -7,7 +7,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
-from softtwin.meshes.files import Axes, Unit
+from softtwin.meshes.io import Axes, Unit
 
 from ..address import Address
 from ..config import ConfigError

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.files import write_body
+from softtwin.meshes.io import write_body
 from softtwin.meshes.metrics import mesh_quality
 
 from ..inputs import mesh_inputs

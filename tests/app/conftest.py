@@ -14,7 +14,7 @@ from softtwin.app.config import Config, to_toml
 from softtwin.app.twin import Twin
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.clouds import partial_view
-from softtwin.meshes.files import write_body
+from softtwin.meshes.io import write_body
 from softtwin.meshes.shapes import beam
 
 

@@ -15,7 +15,7 @@ import pyvista
 
 from softtwin.app.cli import main
 from softtwin.app.config import Config, to_toml
-from softtwin.meshes.files import read_body
+from softtwin.meshes.io import read_body
 
 from .conftest import run
 

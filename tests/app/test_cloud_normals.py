@@ -11,7 +11,7 @@ import pytest
 from softtwin.app.register import CloudFile, find_clouds, register_clouds
 from softtwin.app.twin import Twin
 from softtwin.meshes.export import Coordinates, write_points
-from softtwin.meshes.files import FileError, read_cloud
+from softtwin.meshes.io import FileError, read_cloud
 from softtwin.registration.cloud import turned
 from softtwin.registration.pose import Pose
 from softtwin.registration.residuals import SurfaceDistance

@@ -13,7 +13,7 @@ import pyvista
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.files import read_fields
+from softtwin.meshes.io import read_fields
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet, DataSetError
 from softtwin.reference.data.merge import merge

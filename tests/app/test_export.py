@@ -11,7 +11,7 @@ import pyvista
 from softtwin.app.config import Config, ConfigError
 from softtwin.app.export import FORMATS, Exporter, file_names
 from softtwin.app.twin import Twin
-from softtwin.meshes.files import read_surface
+from softtwin.meshes.io import read_surface
 from softtwin.registration.result import Registration
 
 from .conftest import pulled, seen_cloud

@@ -16,7 +16,7 @@ from softtwin.app.quickstart import CAMERA, POINTS
 from softtwin.app.twin import Twin
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import partial_view
-from softtwin.meshes.files import read_body
+from softtwin.meshes.io import read_body
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.solve.problem import Problem
 from softtwin.registration.pose import Pose

@@ -17,7 +17,7 @@ from softtwin.app.cli import softtwin
 from softtwin.app.config import ConfigError, parse_config
 from softtwin.app.parameters import NamedParameter, ParameterError, priors_taken
 from softtwin.meshes.body import Body, Surface
-from softtwin.meshes.files import read_body, write_body
+from softtwin.meshes.io import read_body, write_body
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.solve.problem import Loading, Problem
 

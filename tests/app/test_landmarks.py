@@ -17,7 +17,7 @@ from softtwin.app.register import CloudFile, register_clouds
 from softtwin.app.streams import Mailbox
 from softtwin.app.twin import Twin
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import FileError
+from softtwin.meshes.io import FileError
 from softtwin.registration.pose import Pose
 
 from .conftest import pulled, run, seen_cloud

@@ -12,7 +12,7 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.app.cli import main
 from softtwin.app.config import parse_config, to_toml
-from softtwin.meshes.files import read_body
+from softtwin.meshes.io import read_body
 
 # Mean error of frame 1, metres: the figure asked for on the mesh that made the truth; on the other mesh its own error.
 BOUNDS = {"default": 1e-4, "remeshed": 1.5e-3}

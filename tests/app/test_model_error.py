@@ -18,7 +18,7 @@ from softtwin.app.config import ConfigError
 from softtwin.app.stages.model_error import is_current, model_error_stage
 from softtwin.app.twin import FORMER_MODEL_ERROR, MODEL_ERROR, Twin, find_twin, forward_models
 from softtwin.app.workspace import open_workspace
-from softtwin.meshes.files import read_body
+from softtwin.meshes.io import read_body
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.discrepancy import DiscrepancyError, read_discrepancy
 from softtwin.surrogate.twin import load

@@ -19,7 +19,7 @@ from softtwin.app.organ import make_organ
 from softtwin.meshes.attachment import RegionError
 from softtwin.meshes.body import Body, BodyError, Surface
 from softtwin.meshes.export import Coordinates, write_surface
-from softtwin.meshes.files import FileError, UnitWarning
+from softtwin.meshes.io import FileError, UnitWarning
 from softtwin.meshes.shapes import beam, liver_phantom
 
 PHANTOM_SIZE = 0.016
@@ -153,7 +153,7 @@ def test_coordinates_in_words_are_on_the_axes_of_the_source(files: Path, where: 
 def test_clouds_are_read_on_the_axes_of_the_body(files: Path, tmp_path: Path) -> None:
     """A cloud beside a source in RAS must fall on the body that was made of it."""
     from softtwin.app.twin import coordinates_of
-    from softtwin.meshes.files import read_cloud
+    from softtwin.meshes.io import read_cloud
 
     np.savetxt(tmp_path / "cloud.txt", 1e3 * make(files).points, fmt="%.17g")
     for entries in ({"source": "organ.vtu:ras"}, {"frame": "ras"}, {"source": "organ.vtu:lps"}, {}):
@@ -201,7 +201,7 @@ def test_an_inner_surface_outside_the_organ_is_refused_and_a_part_outside_is_sai
     assert any(note.startswith("warning: tumour: ") and " mm" in note for note in notes), notes
 
 
-@pytest.mark.filterwarnings("ignore::softtwin.meshes.files.UnitWarning")
+@pytest.mark.filterwarnings("ignore::softtwin.meshes.io.UnitWarning")
 @pytest.mark.parametrize("entries", [{"nodes": 300}, {"cell_size": 0.01}])
 def test_millimetres_read_as_metres_are_refused_at_once(
     files: Path, monkeypatch: pytest.MonkeyPatch, entries: dict[str, Any]
@@ -273,7 +273,7 @@ def test_the_phantom_takes_an_attachment_in_words() -> None:
 
 
 def test_unit_warnings_stay_for_clouds(tmp_path: Path) -> None:
-    from softtwin.meshes.files import read_cloud
+    from softtwin.meshes.io import read_cloud
 
     np.save(tmp_path / "cloud.npy", 100 * np.eye(3))
     with pytest.warns(UnitWarning, match="--unit mm"):

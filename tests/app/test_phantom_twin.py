@@ -13,7 +13,7 @@ pytest.importorskip("torch", reason="torch is absent")
 from softtwin.app.config import read_config
 from softtwin.app.quickstart import unseen_load
 from softtwin.app.twin import Twin, forward_models
-from softtwin.meshes.files import read_body
+from softtwin.meshes.io import read_body
 from softtwin.meshes.shapes import liver_phantom
 from softtwin.surrogate.low_rank import compressed
 from softtwin.surrogate.twin import load, save

@@ -14,7 +14,7 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 pytest.importorskip("torch", reason="torch is absent")
 
 from softtwin.app.cli import main
-from softtwin.meshes.files import read_body, write_body
+from softtwin.meshes.io import read_body, write_body
 
 
 def softtwin(*arguments: object) -> int:

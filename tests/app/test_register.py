@@ -24,7 +24,7 @@ from softtwin.app.twin import Twin
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import FileError, read_body, write_body
+from softtwin.meshes.io import FileError, read_body, write_body
 from softtwin.registration.pose import Pose
 from softtwin.registration.priors import PosePrior
 

@@ -24,7 +24,7 @@ from softtwin.app.twin import Frame, Twin
 from softtwin.app.workspace import Workspace
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import write_body
+from softtwin.meshes.io import write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import LinearResponse
 from softtwin.reference.data.writing import create, write_block

@@ -20,7 +20,7 @@ from softtwin.app.organ import Organ, make_organ
 from softtwin.app.twin import coordinates_of
 from softtwin.meshes.attachment import RegionError
 from softtwin.meshes.body import Body
-from softtwin.meshes.files import FileError, read_volume
+from softtwin.meshes.io import FileError, read_volume
 
 ORGAN = ellipsoid((14.0, -28.0, 218.0), (34.0, 22.0, 27.0))
 TUMOUR = ellipsoid((24.0, -30.0, 222.0), (9.0, 8.0, 8.0))

@@ -25,7 +25,7 @@ from softtwin.app.twin import Frame, Twin
 from softtwin.meshes.body import Body
 from softtwin.meshes.displacement import read_displacement
 from softtwin.meshes.export import SURFACE_FORMATS, Coordinates
-from softtwin.meshes.files import FileError, read_surface, read_volume
+from softtwin.meshes.io import FileError, read_surface, read_volume
 from softtwin.registration.pose import read_landmarks
 from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Judgement, Verdict

@@ -29,7 +29,7 @@ from softtwin.app.workspace import locked, open_workspace, read_records, timed
 from softtwin.meshes.body import Body, BodyError
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import outer
-from softtwin.meshes.files import read_body, write_body
+from softtwin.meshes.io import read_body, write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.jacobians import stored_modes

@@ -17,7 +17,7 @@ pytest.importorskip("torch", reason="torch is absent")
 
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import target_points
-from softtwin.meshes.files import read_body
+from softtwin.meshes.io import read_body
 
 pytestmark = pytest.mark.contract
 FENICSX = ("dolfinx", "dolfinx_solver", "ufl", "basix", "ffcx", "petsc4py", "slepc4py", "mpi4py")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.cells import CellError, one_kind
-from softtwin.meshes.files import FileError, Volume, read_mesh, read_surface
+from softtwin.meshes.io import FileError, Volume, read_mesh, read_surface
 from softtwin.meshes.shapes import beam
 
 CASES = Path(__file__).parents[3] / "shared" / "data" / "cases"

@@ -20,7 +20,7 @@ from softtwin.meshes.displacement import (
     write_displacement,
 )
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.files import FileError
+from softtwin.meshes.io import FileError
 from softtwin.meshes.quadrature import shape_functions
 from softtwin.meshes.shapes import beam
 

@@ -9,7 +9,7 @@ import pytest
 
 from softtwin.meshes.body import Body, BodyError
 from softtwin.meshes.elements import KINDS
-from softtwin.meshes.files import read_body, read_fields, write_body, write_deformed
+from softtwin.meshes.io import read_body, read_fields, write_body, write_deformed
 from softtwin.meshes.shapes import beam
 
 SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [2, 0], [2, 1]])

@@ -14,7 +14,7 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.export import SURFACE_FORMATS, Coordinates, write_points, write_series, write_surface
-from softtwin.meshes.files import (
+from softtwin.meshes.io import (
     FileError,
     read_cloud,
     read_surface,

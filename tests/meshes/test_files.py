@@ -7,20 +7,22 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body, BodyError, Surface
-from softtwin.meshes.files import (
+from softtwin.meshes.grid import gridded
+from softtwin.meshes.io import (
+    ContentError,
     FileError,
     UnitWarning,
     Volume,
     read_body,
     read_cloud,
     read_mesh,
+    read_points,
     read_surface,
     read_volume,
     stated_axes,
     write_body,
     write_deformed,
 )
-from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam
 
 LIVER = Path(__file__).parents[2].parent / "shared" / "data" / "liver"
@@ -357,7 +359,7 @@ def test_an_msh_of_version_1_is_read_with_its_own_node_numbers(tmp_path: Path) -
     points, cells = read_volume(tmp_path / "old.msh")
     assert points.shape == (5, 3) and cells.tolist() == [[0, 1, 2, 3], [1, 4, 2, 3]]
     (tmp_path / "cut.msh").write_text(_FIRST_MSH[: _FIRST_MSH.index("$ENDELM")])
-    with pytest.raises(FileError, match=r"cut\.msh: could not be read as MSH 1; .* save it as MSH 2 or 4"):
+    with pytest.raises(FileError, match=r"cut\.msh: could not be read as msh; .*MSH 1: .* save it as MSH 2 or 4"):
         read_volume(tmp_path / "cut.msh")
 
 
@@ -377,10 +379,22 @@ def test_a_pcd_cloud_is_read_without_its_empty_pixels(encoding: str, tmp_path: P
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_cloud_of_numbers_that_are_none_is_refused(value: float, tmp_path: Path) -> None:
-    np.savetxt(tmp_path / "cloud.txt", [[0.1, 0.2, 0.3], [0.1, value, 0.3]])
-    with pytest.raises(FileError, match="expected finite coordinates, got NaN or infinity in 1 of 2 points"):
+def test_rows_without_a_measurement_are_left_out_and_counted(value: float, tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "cloud.txt", [[0.1, 0.2, 0.3], [0.1, value, 0.3], [0.2, 0.2, 0.3]])
+    cloud = read_points(tmp_path / "cloud.txt")
+    assert cloud.points.tolist() == [[0.1, 0.2, 0.3], [0.2, 0.2, 0.3]] and cloud.rows == 3
+    assert cloud.said == ("points: 1 of 3 rows have no measurement (NaN or infinity) and were left out",)
+    np.savetxt(tmp_path / "cloud.txt", [[0.1, value, 0.3], [value, value, value]])
+    with pytest.raises(ContentError, match="expected a cloud with measured points, got 2 rows without one"):
         read_cloud(tmp_path / "cloud.txt")
+
+
+def test_zeros_are_pixels_without_a_measurement_but_one_point_may_be_the_origin(tmp_path: Path) -> None:
+    np.save(tmp_path / "cloud.npy", [[[0.1, 0.2, 0.3], [0, 0, 0]], [[0, 0, 0], [0.2, 0.0, 0.3]]])
+    cloud = read_points(tmp_path / "cloud.npy")
+    assert cloud.points.tolist() == [[0.1, 0.2, 0.3], [0.2, 0.0, 0.3]] and "2 of 4 rows are zeros" in cloud.said[0]
+    np.save(tmp_path / "cloud.npy", [[0.1, 0.2, 0.3], [0, 0, 0], [0.2, 0.0, 0.3]])
+    assert len(read_points(tmp_path / "cloud.npy").points) == 3
 
 
 def test_a_text_cloud_cut_in_the_middle_of_a_number_is_refused(tmp_path: Path, ball: Surface) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softtwin.meshes.ply import read_ply
+from softtwin.meshes.io.formats.ply import read_ply
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1.25]])
 TRIANGLES = [[0, 1, 2], [0, 2, 3], [0, 1, 4]]

@@ -14,8 +14,8 @@ from labels import Grid, ellipsoid, write_nifti, write_nrrd
 
 from softtwin.meshes.body import Surface
 from softtwin.meshes.checks import put_in_order
-from softtwin.meshes.files import FileError, is_segmentation
-from softtwin.meshes.labelmap import read_labelmap
+from softtwin.meshes.io import FileError, is_segmentation
+from softtwin.meshes.io.labels import read_labelmap
 from softtwin.meshes.segmentation import (
     distances_to,
     find,

@@ -9,7 +9,7 @@ from scipy.linalg import eigh
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.files import FileError, read_body, write_body
+from softtwin.meshes.io import FileError, read_body, write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.samplers import LoadPlan, draw_load, loaded_nodes

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from softtwin.meshes.files import FileError
+from softtwin.meshes.io import FileError
 from softtwin.registration.pose import Pose, PoseError, from_landmarks, read_landmarks, read_matrix
 from softtwin.registration.priors import PosePrior
 

@@ -21,8 +21,8 @@ import nrrd
 import numpy as np
 from numpy.typing import NDArray
 
-from .body import Floats
-from .files import SEGMENTATIONS, Axes, FileError, Unit, is_labelmap
+from ..body import Floats
+from .common import SEGMENTATIONS, Axes, FileError, Unit, is_labelmap
 
 _NRRD = ".nrrd"
 _SLAB = 1 << 24  # voxels read at once: a file of doubles never stands whole in memory

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .body import Floats, Ints
+from ...body import Floats, Ints
+from .numbers import numbers
+from .polygons import by_length, stripped, triangulated
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -56,7 +58,7 @@ def read_ply(path: Path) -> tuple[Floats, Ints]:
     if not {"x", "y", "z"} <= set(vertices):
         raise ValueError("expected vertices with x, y and z")
     points = np.column_stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"])
-    return points, _triangles(columns)
+    return points, _triangles(points, columns)
 
 
 def read_ply_normals(path: Path) -> Floats | None:
@@ -107,7 +109,7 @@ def _with(element: _Element, one: _Property) -> _Element:
 
 
 def _text_columns(body: bytes, elements: list[_Element]) -> dict[str, dict[str, Column]]:
-    words, at, found = np.array(body.split(), dtype=np.float64), 0, dict[str, dict[str, Column]]()
+    words, at, found = numbers(body.split()), 0, dict[str, dict[str, Column]]()
     for element in elements:
         rows: dict[str, list[NDArray[np.generic]]] = {one.name: [] for one in element.properties}
         if not any(one.count for one in element.properties):
@@ -193,37 +195,31 @@ def _check_rows(element: _Element, came: int) -> None:
         raise ValueError(f"the file is truncated: expected {element.rows} rows of {element.name}, got {came}")
 
 
-def _triangles(columns: dict[str, dict[str, Column]]) -> Ints:
+def _triangles(points: Floats, columns: dict[str, dict[str, Column]]) -> Ints:
     faces = columns.get("face", {})
-    polygons = faces.get("vertex_indices", faces.get("vertex_index", []))
-    parts = [_fan(np.asarray(polygon, dtype=np.int64)) for polygon in _by_length(polygons)]
+    named = [name for name in ("vertex_indices", "vertex_index") if name in faces]
+    if not named and any(len(column) for column in faces.values()):
+        raise ValueError(f"expected faces with vertex_indices, got {', '.join(faces)}")
+    polygons: Column = faces[named[0]] if named else []
+    parts = [triangulated(points, _numbers(polygon, len(points))) for polygon in _by_length(polygons)]
     for strip in columns.get("tristrips", {}).get("vertex_indices", []):
-        parts += [_strip(np.asarray(run, dtype=np.int64)) for run in _runs(np.asarray(strip, dtype=np.int64))]
+        parts.append(stripped(_numbers(run, len(points)) for run in _runs(np.asarray(strip, dtype=np.int64))))
     return np.concatenate([np.empty((0, 3), dtype=np.int64), *parts])
+
+
+def _numbers(corners: NDArray[np.generic], count: int) -> Ints:
+    whole = corners.astype(np.int64)
+    if whole.min(initial=0) < 0 or whole.max(initial=0) >= count or not np.array_equal(whole, corners):
+        raise ValueError(f"a face names a vertex that is not among the {count}")
+    return whole
 
 
 def _by_length(polygons: Column) -> list[NDArray[np.generic]]:
     """Polygons of one length together, (m, k) each."""
     if isinstance(polygons, np.ndarray):
         return [polygons] if len(polygons) else []  # a cloud may have an element `face` without rows
-    lengths = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
-    return [np.stack([polygons[i] for i in np.flatnonzero(lengths == k)]) for k in np.unique(lengths)]
-
-
-def _fan(polygons: Ints) -> Ints:
-    corners = polygons.shape[1]
-    fans = [polygons[:, [0, i, i + 1]] for i in range(1, corners - 1)]
-    return np.stack(fans, axis=1).reshape(-1, 3) if fans else np.empty((0, 3), dtype=np.int64)
+    return list(by_length(polygons))  # type: ignore[arg-type]
 
 
 def _runs(strip: Ints) -> list[Ints]:
     return [run[run >= 0] for run in np.split(strip, np.flatnonzero(strip < 0))]
-
-
-def _strip(run: Ints) -> Ints:
-    """Triangles of a strip: every second one is turned, so that all wind alike."""
-    if len(run) < 3:
-        return np.empty((0, 3), dtype=np.int64)
-    triangles = np.stack([run[:-2], run[1:-1], run[2:]], axis=1)
-    triangles[1::2] = triangles[1::2, ::-1]
-    return triangles
