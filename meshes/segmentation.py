@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import find_objects
+from scipy.ndimage import binary_fill_holes, center_of_mass, distance_transform_edt, find_objects, label, minimum
 from scipy.spatial import cKDTree
 
 from .body import Floats, Surface
-from .io import Axes, FileError, Unit, structure_files
+from .components import CAVITY_SHARE, CAVITY_VOLUME, Cavities, ComponentError, chosen_component, dropped_line
+from .io import SEGMENTATIONS, Axes, FileError, Unit, structure_files
 from .io.labels import LabelMap, read_labelmap, stated_frame
-from .voxels import Voxels, boxed, facing_share, smooth_surface, solid_part, thick_share, without_crumbs
+from .voxels import Voxels, boxed, inside_part, smooth_surface, thick_share, without_crumbs
 
 # One meaning a line; a number behind a name (lesion_2, liver_segment_4) is one of several that are taken together.
 _ALIASES: tuple[frozenset[str], ...] = tuple(
@@ -39,7 +40,7 @@ _ALIASES: tuple[frozenset[str], ...] = tuple(
     )
 )  # fmt: skip
 _THIN = 0.5  # share of voxels in blocks of two by two by two below which a surface is doubtful
-_ENCLOSED = 0.5  # share of a structure's faces that look at the organ: more, and it lies inside
+_ENCLOSED = 0.25  # share of a structure's voxels within the organ's outline: less, and it lies beside the organ
 _SAME_PLACE = 1e-2  # of a voxel's edge
 _LISTED = 40
 _NEAREST = 12  # voxels whose boxes are looked at: the nearest middle need not be that of the nearest box
@@ -73,6 +74,7 @@ class Segmentation:
         structures: what it has.
         volume: the voxels; None for a folder, whose files are read one by one.
         notes: what may be a mistake of the files, one line each.
+        forced: unit that is taken in place of what its files say; None for theirs.
     """
 
     path: Path
@@ -81,6 +83,7 @@ class Segmentation:
     structures: tuple[Structure, ...]
     volume: LabelMap | None
     notes: tuple[str, ...]
+    forced: Unit | None = None
 
     @property
     def listed(self) -> str:
@@ -102,12 +105,13 @@ def frame_of(path: str | Path) -> tuple[Unit, Axes | None]:
     return stated_frame(_files(path)[0] if path.is_dir() else path)
 
 
-def read_segmentation(path: str | Path, axes: Axes | None = None) -> Segmentation:
+def read_segmentation(path: str | Path, axes: Axes | None = None, unit: Unit | None = None) -> Segmentation:
     """The structures of a file or a folder.
 
     Args:
-        path: NIfTI or NRRD file, or a folder of such files, each with one structure that its name says.
+        path: NIfTI, NRRD or MetaImage file, or a folder of such files, each with one structure that its name says.
         axes: of NRRD files that say none.
+        unit: of length, in place of what the files say.
 
     Raises:
         FileError: see `read_labelmap`; nothing is segmented.
@@ -115,10 +119,11 @@ def read_segmentation(path: str | Path, axes: Axes | None = None) -> Segmentatio
     path = Path(path)
     if path.is_dir():
         files = _files(path)
-        unit, stated = stated_frame(files[0])
+        said, stated = stated_frame(files[0])
         structures = tuple(Structure(_stem(file), file) for file in files)
-        return Segmentation(path, unit, stated or axes or "lps", structures, None, ())
-    volume = read_labelmap(path, axes)
+        notes = () if unit in (None, said) else (f"warning: {path} says that it is in {said}; {unit} was taken",)
+        return Segmentation(path, unit or said, stated or axes or "lps", structures, None, notes, unit)
+    volume = read_labelmap(path, axes, unit)
     structures = _structures(volume)
     if not structures:
         raise FileError(f"{path}: expected labelled voxels, got none: all are 0.")
@@ -128,14 +133,14 @@ def read_segmentation(path: str | Path, axes: Axes | None = None) -> Segmentatio
 def _files(folder: Path) -> list[Path]:
     files = structure_files(folder)
     if not files:
-        raise FileError(f"{folder}: expected segmentations (.nii, .nii.gz, .nrrd) in this folder, got none.")
+        raise FileError(f"{folder}: expected segmentations ({', '.join(SEGMENTATIONS)}) in this folder, got none.")
     return files
 
 
 def _structures(volume: LabelMap) -> tuple[Structure, ...]:
     """What a label map has voxels of, under the names that it gives; labels without a name under their number."""
     there = {(layer, value) for layer, labels in enumerate(volume.labels) for value in _values(labels)}
-    named = {place: name for name, place in volume.names.items()}
+    named = volume.names
     every = sorted(there, key=lambda place: (place not in named, place))
     if len(there) == 1 and not named:
         (layer, value), name = every[0], _stem(volume.path)
@@ -152,7 +157,7 @@ def _values(labels: NDArray[Any]) -> list[int]:
 
 
 def _stem(path: Path) -> str:
-    return re.sub(r"(\.seg)?\.(nii|nii\.gz|nrrd)$", "", path.name, flags=re.IGNORECASE)
+    return re.sub(r"(\.seg)?\.(nii|nii\.gz|nrrd|nhdr|mha|mhd)$", "", path.name, flags=re.IGNORECASE)
 
 
 def find(segmentation: Segmentation, name: str) -> tuple[Structure, ...]:
@@ -166,11 +171,13 @@ def find(segmentation: Segmentation, name: str) -> tuple[Structure, ...]:
         FileError: none, with those that there are.
     """
     structures, wanted = segmentation.structures, _plain(name)
+    if one := _numbered(structures, name):
+        return (one,)
     exact = [s for s in structures if _plain(s.name) == wanted or (wanted.isdigit() and s.value == int(wanted))]
     if exact:
-        return tuple(exact[:1])
+        return tuple(_distinct(segmentation, exact)[:1])
     meant = next((group for group in _ALIASES if _without_number(wanted) in group), frozenset({wanted}))
-    close = [s for s in structures if _plain(s.name) in meant]
+    close = _distinct(segmentation, [s for s in structures if _plain(s.name) in meant])
     if not wanted[-1:].isdigit():
         close = close[:1] or [s for s in structures if _without_number(_plain(s.name)) in meant | {wanted}]
     if close:
@@ -180,6 +187,38 @@ def find(segmentation: Segmentation, name: str) -> tuple[Structure, ...]:
         f"{segmentation.path}: expected a label {name!r}, it has {segmentation.listed}."
         + (" These have no names: say which is which by number (--organ 1, --inner tumour=2)." if numbers else "")
     )
+
+
+def _numbered(structures: tuple[Structure, ...], name: str) -> Structure | None:
+    """The K-th of several of one name, which is asked for as `name (K)`; None for other words."""
+    asked = re.fullmatch(r"(.+?)\s*\((\d+)\)", name.strip())
+    if asked is None:
+        return None
+    alike = [s for s in structures if _plain(s.name) == _plain(asked.group(1))]
+    return alike[int(asked.group(2)) - 1] if 0 < int(asked.group(2)) <= len(alike) else None
+
+
+def _distinct(segmentation: Segmentation, found: list[Structure]) -> list[Structure]:
+    """The same structures.
+
+    Raises:
+        FileError: two of them have one name.
+    """
+    names = [_plain(structure.name) for structure in found]
+    alike = [structure for structure in found if names.count(_plain(structure.name)) > 1]
+    if not alike:
+        return found
+    words = [
+        f"{s.name} ({k}): label {s.value} of layer {s.layer}, {_size(segmentation, s)}" for k, s in enumerate(alike, 1)
+    ]
+    raise FileError(
+        f"{segmentation.path}: expected one segment called {alike[0].name!r}, it has {len(alike)}: {'; '.join(words)}. "
+        f'Say which: "{alike[0].name} (2)", or rename one.'
+    )
+
+
+def _size(segmentation: Segmentation, structure: Structure) -> str:
+    return f"{1e6 * voxels_of(segmentation, [structure]).volume:.3g} ml"
 
 
 def the_organ(segmentation: Segmentation) -> str:
@@ -238,7 +277,7 @@ def voxels_of(segmentation: Segmentation, structures: Iterable[Structure]) -> Vo
 
 
 def _part(segmentation: Segmentation, structure: Structure) -> tuple[LabelMap, tuple[slice, ...], NDArray[np.bool_]]:
-    volume = segmentation.volume or read_labelmap(structure.path, segmentation.axes)
+    volume = segmentation.volume or read_labelmap(structure.path, segmentation.axes, segmentation.forced)
     labels = volume.labels[structure.layer]
     filled = labels != 0 if structure.value is None else labels == structure.value
     boxes = find_objects(filled.view(np.uint8))
@@ -256,38 +295,108 @@ def _shape(volume: LabelMap) -> str:
     return f"{' x '.join(map(str, volume.labels.shape[1:]))} of {' x '.join(f'{size:.3g}' for size in sizes)} mm"
 
 
-def organ_surface(segmentation: Segmentation, name: str, inner: Iterable[str] = ()) -> tuple[Surface, list[str]]:
+def organ_surface(
+    segmentation: Segmentation,
+    name: str,
+    inner: Iterable[str] = (),
+    join: Iterable[str] = (),
+    component: str = "largest",
+    cavities: Cavities = "",
+) -> tuple[Surface, list[str]]:
     """The closed surface of an organ, LPS, metres, and what was done to get it.
 
-    Structures inside the organ whose voxels are not the organ's (each voxel has one label) belong to it, and cavities
-    are filled. Of several components the largest is kept.
+    Each voxel has one label, so the organ has a hole or a dent where a structure lies in it: what of the structure lies
+    within the organ's outline belongs to the organ, unless it is a small part. Of several components one is kept. Of
+    its holes those stay that are no noise (see `components.CAVITY_VOLUME`).
 
     Args:
         segmentation: that has it.
         name: the organ.
         inner: names of structures that may lie inside it.
+        join: names of structures that are part of the organ, wherever they lie.
+        component: which is kept (see `components.check_component`).
+        cavities: keep all holes, or fill all; empty for the rule.
 
     Raises:
         FileError: no such label, or it is one voxel thick.
+        ComponentError: no such component.
     """
     chosen = find(segmentation, name)
     voxels, notes = voxels_of(segmentation, chosen), list(segmentation.notes)
     notes.append(_described(segmentation, chosen, voxels))
+    for other in join:
+        both, own = _together(voxels, voxels_of(segmentation, find(segmentation, other)))
+        added = own.filled & ~both.filled
+        voxels = Voxels(both.filled | own.filled, both.to_lps, voxels.cut or own.cut)
+        notes.append(f"segmentation: {other} is joined to {name}, {_millilitres(both, added)} more")
     for other in inner:
-        parts = find(segmentation, other)
-        both, own = _together(voxels, voxels_of(segmentation, parts))
-        if (own.filled & ~both.filled).any() and facing_share(own.filled & ~both.filled, both.filled) > _ENCLOSED:
-            voxels = Voxels(both.filled | own.filled, both.to_lps, voxels.cut)
-            notes.append(f"segmentation: {other} lies inside {name} and was counted to it")
-    whole, dropped, cavities = solid_part(voxels)
+        both, own = _together(voxels, voxels_of(segmentation, find(segmentation, other)))
+        within = inside_part(own.filled, both)
+        share = within.sum() / own.filled.sum()
+        if share <= _ENCLOSED:
+            continue
+        added = within & ~both.filled
+        voxels = Voxels(both.filled | within, both.to_lps, voxels.cut)
+        if added.any():
+            part = "lies inside" if share == 1 else f"lies inside by {100 * share:.0f} %, which fills its place in"
+            notes.append(f"segmentation: {other} {part} {name} and was counted to it, {_millilitres(both, added)} more")
+    kept, dropped = _component(segmentation, voxels, component)
     if dropped > 0:
-        notes.append(f"segmentation: largest component kept, {1e6 * dropped:.3g} ml in others left out")
-    if cavities > 0:
-        notes.append(f"segmentation: cavities of {1e6 * cavities:.3g} ml filled")
+        notes.append(dropped_line(dropped, kept.volume, component))
+    whole, said = _hollow(kept, cavities)
+    notes += said
     if voxels.cut:
         notes.append(f"warning: {name} reaches the edge of the segmented volume, and ends flat where it may go on")
     notes += _check_thickness(segmentation, name, whole)
     return smooth_surface(whole), notes
+
+
+def _millilitres(voxels: Voxels, flags: NDArray[np.bool_]) -> str:
+    return f"{1e6 * Voxels(flags, voxels.to_lps).volume:.3g} ml"
+
+
+def _component(segmentation: Segmentation, voxels: Voxels, component: str) -> tuple[Voxels, float]:
+    """One component, and the volume of the others, cubic metres."""
+    numbers, count = label(voxels.filled)
+    counts = np.bincount(numbers.ravel(), minlength=count + 1)[1:]
+    middles = np.array(center_of_mass(voxels.filled, numbers, range(1, count + 1))).reshape(-1, 3)
+    middles = middles @ voxels.to_lps[:3, :3].T + voxels.to_lps[:3, 3]
+
+    def away(structure: str) -> Floats:
+        both, own = _together(voxels, voxels_of(segmentation, find(segmentation, structure)))
+        distance = distance_transform_edt(~own.filled, sampling=both.spacing)
+        return np.asarray(minimum(distance, label(both.filled)[0], range(1, count + 1)), dtype=np.float64)
+
+    try:
+        number = chosen_component(component, counts.astype(np.float64), middles, away, str(segmentation.path))
+    except ComponentError as error:
+        raise ComponentError(f"{segmentation.path}: {error}") from None
+    one = abs(float(np.linalg.det(voxels.to_lps[:3, :3])))
+    return Voxels(numbers == number + 1, voxels.to_lps, voxels.cut), float(one * (counts.sum() - counts[number]))
+
+
+def _hollow(voxels: Voxels, cavities: Cavities) -> tuple[Voxels, list[str]]:
+    """The voxels with those holes filled that are none of the organ, and what to say of all of them."""
+    holes, count = label(np.asarray(binary_fill_holes(voxels.filled), dtype=np.bool_) & ~voxels.filled)
+    if count == 0:
+        return voxels, []
+    one = abs(float(np.linalg.det(voxels.to_lps[:3, :3])))
+    volumes = one * np.bincount(holes.ravel(), minlength=count + 1)[1:]
+    large = (volumes >= CAVITY_VOLUME) & (volumes >= CAVITY_SHARE * voxels.volume)
+    stay = {"keep": np.ones(count, np.bool_), "fill": np.zeros(count, np.bool_)}.get(cavities, large)
+    said = []
+    if stay.any():
+        said.append(
+            f"segmentation: {stay.sum()} cavities of {1e6 * volumes[stay].sum():.4g} ml stay open; --cavities fill "
+            "fills them; where another label lies in them, --inner or --join makes it part of the organ"
+        )
+    if not stay.all():
+        said.append(
+            f"segmentation: {(~stay).sum()} cavities of {1e6 * volumes[~stay].sum():.3g} ml filled"
+            + ("" if cavities else "; --cavities keep keeps them")
+        )
+    filled = np.concatenate([[False], ~stay])[holes]
+    return Voxels(voxels.filled | filled, voxels.to_lps, voxels.cut), said
 
 
 def inner_surface(segmentation: Segmentation, name: str) -> tuple[Surface, list[str]]:
@@ -381,5 +490,5 @@ def voxel_diagonal(segmentation: Segmentation, name: str) -> float:
         FileError: no such label.
     """
     structure = find(segmentation, name)[0]
-    volume = segmentation.volume or read_labelmap(structure.path, segmentation.axes)
+    volume = segmentation.volume or read_labelmap(structure.path, segmentation.axes, segmentation.forced)
     return float(np.linalg.norm(np.linalg.norm(volume.to_lps[:3, :3], axis=0)))

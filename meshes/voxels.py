@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import binary_fill_holes, distance_transform_edt, find_objects, label
+from scipy.ndimage import distance_transform_edt, find_objects, label
 from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 from vtkmodules.vtkCommonDataModel import vtkImageData, vtkPolyData
 from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D, vtkWindowedSincPolyDataFilter
@@ -24,6 +24,7 @@ _MARGIN = 3  # voxels around what is filled
 _FINEST = 160  # cells along the longest side: voxels finer than this are taken together
 _ITERATIONS, _PASS_BAND = 20, 0.02
 _FITS = 3
+_LID = 4.0  # radii of a structure: with 1, 2 and 8 the tumour below is found within by 12, 36 and 48 %
 _CRUMB = 8  # voxels: smaller components are no structure
 
 
@@ -66,20 +67,6 @@ def boxed(filled: Flags, start: tuple[int, ...], to_lps: Floats, cut: bool) -> V
     return Voxels(filled, moved, cut)
 
 
-def solid_part(voxels: Voxels) -> tuple[Voxels, float, float]:
-    """The largest component without cavities; volumes of the other components and of the cavities, cubic metres.
-
-    Args:
-        voxels: an organ.
-    """
-    numbers, count = label(voxels.filled)
-    kept = voxels.filled if count < 2 else numbers == np.bincount(numbers.ravel())[1:].argmax() + 1
-    whole = np.asarray(binary_fill_holes(kept), dtype=np.bool_)
-    one = abs(np.linalg.det(voxels.to_lps[:3, :3]))
-    dropped, filled = voxels.filled.sum() - kept.sum(), whole.sum() - kept.sum()
-    return Voxels(whole, voxels.to_lps, voxels.cut), float(dropped * one), float(filled * one)
-
-
 def without_crumbs(voxels: Voxels) -> Voxels:
     """The components of more than a few voxels, all of them where there is no such.
 
@@ -111,21 +98,27 @@ def thick_share(voxels: Voxels) -> float:
     return float(blocks.sum() / max(1, voxels.filled.sum()))
 
 
-def facing_share(inner: Flags, outer: Flags) -> float:
-    """Share of an inner structure's faces that look at what is around it: 1 where it is enclosed.
+def inside_part(inner: Flags, outer: Voxels) -> Flags:
+    """Which voxels of a structure lie within the outline of an organ whose voxels it displaces.
+
+    The outline is the organ closed by balls four times as large as the largest that fits into the structure: that fills
+    the tunnel of a vessel that leaves it, and the dent of a tumour in its edge up to a flat lid. Where the organ bulges
+    the lid is too low: of the tumour in shared/data/cases 48 % are found within, 60 % are (of the vessel 77 and 79).
 
     Args:
         inner: voxels of the structure, (i, j, k).
-        outer: voxels of what may enclose it, of the same box.
+        outer: the organ, of the same box.
     """
-    faces = enclosed = 0
-    inner, outer = np.pad(inner, 1), np.pad(outer, 1)
-    for axis in range(3):
-        for step in (1, -1):
-            bare = inner & ~np.roll(inner, step, axis)
-            faces += int(bare.sum())
-            enclosed += int((bare & np.roll(outer, step, axis)).sum())
-    return enclosed / max(1, faces)
+    box = find_objects((inner | outer.filled).view(np.uint8))[0]
+    radius = _LID * float(distance_transform_edt(np.pad(inner[box], 1), sampling=outer.spacing).max())
+    pads = [(int(np.ceil(radius / edge)) + 1,) * 2 for edge in outer.spacing]
+    organ = np.pad(outer.filled[box], pads)
+    grown = distance_transform_edt(~organ, sampling=outer.spacing) <= radius
+    closed = distance_transform_edt(grown, sampling=outer.spacing) > radius
+    within = np.zeros_like(inner)
+    core = tuple(slice(low, low + side) for (low, _), side in zip(pads, outer.filled[box].shape, strict=True))
+    within[box] = inner[box] & (closed | organ)[core]
+    return within
 
 
 def smooth_surface(voxels: Voxels) -> Surface:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -18,9 +19,16 @@ UNITS: tuple[str, ...] = get_args(Unit)
 AXES: tuple[str, ...] = get_args(Axes)
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 LARGEST, SMALLEST = 2.0, 5e-3  # metres: an organ outside these was read in the wrong unit
-SEGMENTATIONS = (".nii", ".nii.gz", ".nrrd")
+SEGMENTATIONS = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 TURN = np.array([-1.0, -1.0, 1.0])  # from RAS to LPS and back
 HEAD = 2048  # bytes in which a file says what it is
+_SPELLINGS: Mapping[str, tuple[float, Unit]] = {
+    **dict.fromkeys(("m", "meter", "metre"), (1.0, "m")),
+    **dict.fromkeys(("cm", "centimeter", "centimetre"), (1e-2, "cm")),
+    **dict.fromkeys(("mm", "millimeter", "millimetre"), (1e-3, "mm")),
+    # Micro sign, Greek mu, and what is typed for them; coordinates beside such a file are in millimetres.
+    **dict.fromkeys(("um", "\u00b5m", "\u03bcm", "micron", "micrometer", "micrometre"), (1e-6, "mm")),
+}
 
 
 class FileError(ValueError):
@@ -44,6 +52,16 @@ def in_metres(lengths: ArrayLike, unit: Unit) -> Floats:
     """
     # Dividing by a whole number rounds once; multiplying by 0.001 would round twice.
     return np.asarray(lengths, dtype=np.float64) / round(1 / METRES[unit])
+
+
+def spelled_unit(word: str) -> tuple[float, Unit] | None:
+    """Metres in a unit of length as programs spell it, and the unit of coordinates beside it; None for another word.
+
+    Args:
+        word: in any case, singular or plural, with blanks or quotes around it.
+    """
+    plain = word.strip("\"' ").lower()
+    return _SPELLINGS.get(plain) or _SPELLINGS.get(plain.removesuffix("s"))
 
 
 def is_labelmap(path: str | Path) -> bool:

@@ -1,7 +1,9 @@
-"""Label maps as hospitals, TotalSegmentator and 3D Slicer write them: whole numbers in voxels, names, a place in space.
+"""Label maps as hospitals, TotalSegmentator and 3D Slicer write them: whole numbers in voxels, names, a place.
 
-NIfTI stands in RAS in the unit that it names, NRRD in the space that it names; inside everything is LPS and metres.
-TotalSegmentator writes names into an XML extension of NIfTI's header (its `--ml`), Slicer into fields of a `.seg.nrrd`.
+NIfTI (by nibabel) stands in RAS in the unit that it names, NRRD (by pynrrd) in the space that it names, MetaImage in
+LPS and millimetres; inside everything is LPS and metres. TotalSegmentator writes names into an XML extension of NIfTI's
+header (its `--ml`), Slicer into fields of a `.seg.nrrd`. SimpleITK would read all three formats, for 270 MB more, and
+knows neither TotalSegmentator's names nor the second place that a NIfTI header may give; MetaImage is read here.
 """
 
 from __future__ import annotations
@@ -9,9 +11,9 @@ from __future__ import annotations
 import re
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -22,23 +24,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..body import Floats
-from .common import SEGMENTATIONS, Axes, FileError, Unit, is_labelmap
+from .common import METRES, SEGMENTATIONS, Axes, FileError, Unit, is_labelmap, spelled_unit
 
-_NRRD = ".nrrd"
+_NRRD, _META = (".nrrd", ".nhdr"), (".mha", ".mhd")
 _SLAB = 1 << 24  # voxels read at once: a file of doubles never stands whole in memory
 _MOST_LABEL = 65535
+_MOST_FIELDS = 1000  # of a header
 _UNREADABLE: tuple[type[Exception], ...] = (
     nibabel.filebasedimages.ImageFileError, nrrd.NRRDError, EOFError, OSError, ValueError, zlib.error,
 )  # fmt: skip
 _TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # from RAS to LPS
-_NIFTI_UNITS: Mapping[str, tuple[float, Unit]] = {
-    "mm": (1e-3, "mm"), "unknown": (1e-3, "mm"), "meter": (1.0, "m"), "micron": (1e-6, "mm"),
+# NRRD names a space by the ends of its axes; each is the first, second or third here.
+_ENDS: Mapping[str, tuple[int, float]] = {
+    "left": (0, 1.0), "right": (0, -1.0), "posterior": (1, 1.0), "anterior": (1, -1.0),
+    "superior": (2, 1.0), "inferior": (2, -1.0),
 }  # fmt: skip
-_NRRD_UNITS: Mapping[str, tuple[float, Unit]] = {
-    "mm": (1e-3, "mm"), "": (1e-3, "mm"), "cm": (1e-2, "cm"), "m": (1.0, "m"), "um": (1e-6, "mm"),
-}  # fmt: skip
-_SPACES: Mapping[str, Axes] = {
-    "left-posterior-superior": "lps", "lps": "lps", "right-anterior-superior": "ras", "ras": "ras",
+_WHOLE = 1e-3  # how far a label may be from a whole number: slopes and resampling in single precision leave less
+_META_TYPES = {
+    "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
+    "MET_LONG": "i4", "MET_ULONG": "u4", "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
 }  # fmt: skip
 _FORMS_AGREE = 1e-3  # metres between the places that the two forms of a NIfTI header give a voxel
 
@@ -53,8 +58,9 @@ class LabelMap:
         to_lps: from voxel numbers to the voxel's middle, (4, 4), LPS, metres.
         unit: unit of length that the file is in.
         axes: axes that the file is in; None where it says none.
-        names: layer and label by name; empty where the file has no names.
+        names: name by layer and label; empty where the file has no names.
         notes: what may be a mistake of the file, one line each.
+        scale: metres in the unit that its numbers are in.
     """
 
     path: Path
@@ -62,22 +68,37 @@ class LabelMap:
     to_lps: Floats
     unit: Unit
     axes: Axes | None
-    names: Mapping[str, tuple[int, int]]
+    names: Mapping[tuple[int, int], str]
     notes: tuple[str, ...] = ()
+    scale: float = 1e-3
 
 
-def read_labelmap(path: str | Path, axes: Axes | None = None) -> LabelMap:
-    """The voxels of a NIfTI or NRRD file.
+def read_labelmap(path: str | Path, axes: Axes | None = None, unit: Unit | None = None) -> LabelMap:
+    """The voxels of a NIfTI, NRRD or MetaImage file.
 
     Args:
-        path: `.nii`, `.nii.gz`, `.nrrd` or `.seg.nrrd` file.
+        path: `.nii`, `.nii.gz`, `.nrrd`, `.seg.nrrd`, `.nhdr`, `.mha` or `.mhd` file.
         axes: what axes an NRRD file is in that does not say so; where it does, the file's own are taken.
+        unit: of length, in place of what the file says, which a note names.
 
     Raises:
         FileError: missing, damaged or unknown file, not three axes in space, no whole numbers, or no place in space.
     """
     with _reading(path := Path(path)):
-        return _read_nrrd(path, axes) if path.suffix.lower() == _NRRD else _read_nifti(path)
+        found = _reader(path)(path, axes)
+    return found if unit is None or (unit == found.unit and found.scale == METRES[unit]) else _in_unit(found, unit)
+
+
+def _in_unit(volume: LabelMap, unit: Unit) -> LabelMap:
+    place = volume.to_lps.copy()
+    place[:3] *= METRES[unit] / volume.scale
+    note = f"warning: {volume.path} says that it is in {volume.unit}; --unit {unit} was taken, as you say"
+    return replace(volume, to_lps=place, unit=unit, scale=METRES[unit], notes=(*volume.notes, note))
+
+
+def _reader(path: Path) -> Callable[[Path, Axes | None], LabelMap]:
+    suffix = path.suffix.lower()
+    return _read_nrrd if suffix in _NRRD else _read_meta if suffix in _META else _read_nifti
 
 
 def stated_frame(path: str | Path) -> tuple[Unit, Axes | None]:
@@ -90,9 +111,13 @@ def stated_frame(path: str | Path) -> tuple[Unit, Axes | None]:
         FileError: as `read_labelmap`.
     """
     with _reading(path := Path(path)):
-        if path.suffix.lower() == _NRRD:
+        if path.suffix.lower() in _NRRD:
             header = nrrd.read_header(str(path))
-            return _nrrd_unit(path, header)[1], _nrrd_axes(path, header)
+            space = _nrrd_space(path, header)
+            return _nrrd_unit(path, header)[1], None if space is None else _axes_beside(space)
+        if path.suffix.lower() in _META:
+            _meta_header(path)
+            return "mm", "lps"
         return _nifti_unit(path, nibabel.load(path).header)[1], "ras"
 
 
@@ -113,7 +138,7 @@ def _reading(path: Path) -> Iterator[None]:
         raise FileError(f"{path}: could not be read; the file may be truncated or damaged ({error}).") from error
 
 
-def _read_nifti(path: Path) -> LabelMap:
+def _read_nifti(path: Path, axes: Axes | None) -> LabelMap:
     image: Any = nibabel.load(path, keep_file_open=True)  # else each slab is unpacked from the file's beginning
     shape = image.shape
     if len(shape) < 3 or any(count != 1 for count in shape[3:]):
@@ -121,7 +146,8 @@ def _read_nifti(path: Path) -> LabelMap:
     scale, unit = _nifti_unit(path, image.header)
     labels = _gathered(path, shape[:3], _slabs(image.dataobj, shape))
     to_lps = _checked_place(path, np.diag([scale, scale, scale, 1.0]) @ _TURN @ image.affine)
-    return LabelMap(path, labels[None], to_lps, unit, "ras", _nifti_names(image.header), _nifti_notes(image, scale))
+    names, notes = _nifti_names(image.header), _nifti_notes(image, scale)
+    return LabelMap(path, labels[None], to_lps, unit, "ras", names, notes, scale)
 
 
 def _slabs(voxels: Any, shape: tuple[int, ...]) -> Iterator[NDArray[Any]]:
@@ -150,12 +176,15 @@ def _whole(path: Path, values: NDArray[Any]) -> NDArray[Any]:
     """
     if values.dtype.kind not in "iufb":
         raise FileError(f"{path}: expected whole numbers in its voxels, got {values.dtype}.")
-    if values.dtype.kind == "f" and not np.array_equal(values, np.rint(values)):
-        strange = values[values != np.rint(values)]
-        raise FileError(
-            f"{path}: expected a label, a whole number, in each voxel, got {strange.ravel()[0]:.4g}; is it a map of "
-            "probabilities, a resampled segmentation or the image itself?"
-        )
+    if values.dtype.kind == "f":
+        whole = np.rint(values)
+        strange = ~(np.abs(values - whole) <= _WHOLE)  # NaN is strange, too
+        if strange.any():
+            raise FileError(
+                f"{path}: expected a label, a whole number, in each voxel, got {values[strange].ravel()[0]:.4g}; is it "
+                "a map of probabilities, a resampled segmentation or the image itself?"
+            )
+        values = whole
     low, high = float(values.min(initial=0)), float(values.max(initial=0))
     if low < 0 or high > _MOST_LABEL:
         raise FileError(f"{path}: expected labels in 0..{_MOST_LABEL}, got {low:g}..{high:g}; is it the image itself?")
@@ -164,9 +193,10 @@ def _whole(path: Path, values: NDArray[Any]) -> NDArray[Any]:
 
 def _nifti_unit(path: Path, header: Any) -> tuple[float, Unit]:
     named = header.get_xyzt_units()[0]
-    if named not in _NIFTI_UNITS:
-        raise FileError(f"{path}: expected a unit of length among {', '.join(_NIFTI_UNITS)}, got {named!r}.")
-    return _NIFTI_UNITS[named]
+    found = spelled_unit("mm" if named == "unknown" else named)
+    if found is None:
+        raise FileError(f"{path}: expected a unit of length (metre, mm, micron), got {named!r}.")
+    return found
 
 
 def _nifti_notes(image: Any, scale: float) -> tuple[str, ...]:
@@ -187,9 +217,9 @@ def _nifti_notes(image: Any, scale: float) -> tuple[str, ...]:
     return ()
 
 
-def _nifti_names(header: Any) -> dict[str, tuple[int, int]]:
+def _nifti_names(header: Any) -> dict[tuple[int, int], str]:
     """Names from TotalSegmentator's extension (Caret's XML: a Label with a Key holds its name)."""
-    found: dict[str, tuple[int, int]] = {}
+    found: dict[tuple[int, int], str] = {}
     for extension in header.extensions:
         content = extension.get_content()
         text = content if isinstance(content, bytes) else str(content).encode()
@@ -202,8 +232,8 @@ def _nifti_names(header: Any) -> dict[str, tuple[int, int]]:
             continue
         for label in tree.iter("Label"):
             if label.get("Key", "").isdigit() and (label.text or "").strip():
-                found[(label.text or "").strip()] = (0, int(label.get("Key", "0")))
-    return {name: place for name, place in found.items() if place[1] > 0}
+                found[(0, int(label.get("Key", "0")))] = (label.text or "").strip()
+    return {place: name for place, name in found.items() if place[1] > 0}
 
 
 def _read_nrrd(path: Path, axes: Axes | None) -> LabelMap:
@@ -216,19 +246,22 @@ def _read_nrrd(path: Path, axes: Axes | None) -> LabelMap:
             f"with {len(spatial)} axes in space."
         )
     layered = np.moveaxis(voxels, spatial, (-3, -2, -1)).reshape(-1, *np.array(voxels.shape)[spatial])
-    stated = _nrrd_axes(path, header) or axes
-    if stated is None:
+    space = _nrrd_space(path, header)
+    if space is None and axes is None:
         raise FileError(
             f"{path}: expected a space (left-posterior-superior or right-anterior-superior), the file says none; say "
             "it with --frame lps or --frame ras."
         )
+    if space is None:
+        space = _TURN.diagonal()[:3] if axes == "ras" else np.ones(3)
     scale, unit = _nrrd_unit(path, header)
     place = np.eye(4)
     place[:3, :3] = scale * directions[spatial].T
     place[:3, 3] = scale * np.asarray(header.get("space origin", np.zeros(3)), dtype=np.float64)
-    to_lps = _checked_place(path, _TURN @ place if stated == "ras" else place)
+    to_lps = _checked_place(path, np.diag([*space, 1.0]) @ place)
     names = _segment_names(path, header, len(layered))
-    return LabelMap(path, np.stack([_whole(path, layer) for layer in layered]), to_lps, unit, stated, names)
+    labels = np.stack([_whole(path, layer) for layer in layered])
+    return LabelMap(path, labels, to_lps, unit, _axes_beside(space), names, _space_notes(path, header), scale)
 
 
 def _nrrd_directions(path: Path, header: Mapping[str, Any]) -> Floats:
@@ -240,27 +273,118 @@ def _nrrd_directions(path: Path, header: Mapping[str, Any]) -> Floats:
     raise FileError(f"{path}: expected where its voxels lie (space directions), the file does not say it.")
 
 
-def _nrrd_axes(path: Path, header: Mapping[str, Any]) -> Axes | None:
-    named = header.get("space", "")
+def _nrrd_space(path: Path, header: Mapping[str, Any]) -> Floats | None:
+    """Sign of each axis from the file's space to LPS, (3,); None where it says no space.
+
+    Raises:
+        FileError: a space without left and right, or with its axes in another order.
+    """
+    named = str(header.get("space", "")).lower()
     if not named:
         return None
-    if named.lower() not in _SPACES:
+    words = named.removesuffix("-time").split("-")
+    if len(words) == 1 and len(named) in (3, 4):
+        letters = named[:3] if named.endswith("t") or len(named) == 3 else "???"
+        words = [next((word for word in _ENDS if word[0] == letter), "") for letter in letters]
+    ends = [_ENDS.get(word) for word in words]
+    if len(ends) != 3 or any(end is None or end[0] != axis for axis, end in enumerate(ends)):
         raise FileError(
-            f"{path}: expected the space left-posterior-superior or right-anterior-superior, got {named!r}."
+            f"{path}: expected the space left-posterior-superior, right-anterior-superior or another sign of these "
+            f"axes, got {named!r}."
         )
-    return _SPACES[named.lower()]
+    return np.array([end[1] for end in ends if end is not None])
+
+
+def _axes_beside(space: Floats) -> Axes:
+    """Axes in which coordinates beside a file are taken: its own, or LPS where its own are neither RAS nor LPS."""
+    return "ras" if np.array_equal(space, _TURN.diagonal()[:3]) else "lps"
+
+
+def _space_notes(path: Path, header: Mapping[str, Any]) -> tuple[str, ...]:
+    space = _nrrd_space(path, header)
+    if space is None or np.array_equal(space, np.ones(3)) or _axes_beside(space) == "ras":
+        return ()
+    return (f"segmentation: {path} is in {header['space']}; coordinates beside it are taken in LPS",)
 
 
 def _nrrd_unit(path: Path, header: Mapping[str, Any]) -> tuple[float, Unit]:
-    named = {str(word).strip('" ') for word in header.get("space units", [""])} or {""}
-    if len(named) != 1 or not named <= set(_NRRD_UNITS):
+    named = {str(word).strip("\"' ") for word in header.get("space units", [""])} or {""}
+    found = spelled_unit(min(named) or "mm") if len(named) == 1 else None
+    if found is None:
         raise FileError(f"{path}: expected one of the units mm, cm, m and um for all axes, got {sorted(named)}.")
-    return _NRRD_UNITS[named.pop()]
+    return found
 
 
-def _segment_names(path: Path, header: Mapping[str, Any], layers: int) -> dict[str, tuple[int, int]]:
+def _read_meta(path: Path, axes: Axes | None) -> LabelMap:
+    """MetaImage, as ITK writes it: millimetres and LPS (itkMetaImageIO; AnatomicalOrientation only describes it)."""
+    fields, data = _meta_header(path)
+    shape = _meta_numbers(path, fields, "DimSize", 3).astype(int)
+    kind = _META_TYPES.get(fields.get("ElementType", ""))
+    if kind is None or int(fields.get("ElementNumberOfChannels", "1")) != 1 or (shape < 1).any():
+        raise FileError(f"{path}: expected one number of a known type in each voxel, got "
+                        f"{fields.get('ElementType')} x {fields.get('ElementNumberOfChannels', '1')}.")  # fmt: skip
+    is_big = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "False")).lower() == "true"
+    if fields.get("BinaryData", "True").lower() != "true":
+        raise FileError(f"{path}: expected binary voxels, got text; save it with binary data.")
+    if fields.get("CompressedData", "False").lower() == "true":
+        data = zlib.decompress(data)
+    wanted = int(shape.prod()) * np.dtype(kind).itemsize
+    if len(data) < wanted:
+        raise FileError(f"{path}: the file is truncated: expected {wanted} bytes of voxels, got {len(data)}.")
+    voxels = np.frombuffer(data, (">" if is_big else "<") + kind, int(shape.prod())).reshape(shape, order="F")
+    rotation = _meta_numbers(path, fields, "TransformMatrix", 9, np.eye(3).ravel(), ("Rotation", "Orientation"))
+    place = np.eye(4)
+    sizes = _meta_numbers(path, fields, "ElementSpacing", 3, np.ones(3), ("ElementSize",))
+    place[:3, :3] = rotation.reshape(3, 3).T * sizes  # ITK writes the direction of each axis as a row
+    place[:3, 3] = _meta_numbers(path, fields, "Offset", 3, np.zeros(3), ("Origin", "Position"))
+    place[:3] *= METRES["mm"]
+    return LabelMap(path, _whole(path, voxels)[None], _checked_place(path, place), "mm", "lps", {})
+
+
+def _meta_numbers(
+    path: Path,
+    fields: Mapping[str, str],
+    name: str,
+    count: int,
+    default: Floats | None = None,
+    other: Sequence[str] = (),
+) -> Floats:
+    text = next((fields[known] for known in (name, *other) if known in fields), None)
+    if text is None and default is not None:
+        return default
+    numbers = np.array((text or "").split(), dtype=np.float64)
+    if numbers.shape != (count,):
+        raise FileError(f"{path}: expected {count} numbers as {name}, got {text!r}.")
+    return numbers
+
+
+def _meta_header(path: Path) -> tuple[dict[str, str], bytes]:
+    """Fields of a header, and the bytes behind it or in the file that it names."""
+    content, at, fields = path.read_bytes(), 0, dict[str, str]()
+    while "ElementDataFile" not in fields:
+        end = content.find(b"\n", at)
+        key, equals, value = content[at : end if end >= 0 else None].decode("latin-1").partition("=")
+        if (end < 0 and not equals) or not equals or len(fields) > _MOST_FIELDS:
+            raise FileError(f"{path}: expected a header of MetaImage that ends with ElementDataFile.")
+        fields[key.strip()] = value.strip()
+        at = end + 1 if end >= 0 else len(content)
+    if fields.get("ObjectType", "Image") != "Image" or fields.get("NDims", "3") != "3":
+        raise FileError(f"{path}: expected an image of three axes, got {fields.get('ObjectType')} of "
+                        f"{fields.get('NDims')}.")  # fmt: skip
+    name = fields["ElementDataFile"]
+    if name.upper() == "LOCAL":
+        return fields, content[at:]
+    if name.upper() == "LIST" or "%" in name:
+        raise FileError(f"{path}: expected its voxels in one file, got {name!r}; save it as .mha.")
+    beside = path.parent / Path(name.replace("\\", "/")).name
+    if not beside.is_file():
+        raise FileError(f"{path}: expected its voxels in {beside}, which is not there.")
+    return fields, beside.read_bytes()
+
+
+def _segment_names(path: Path, header: Mapping[str, Any], layers: int) -> dict[tuple[int, int], str]:
     """Layer and label of Slicer's segments; older files have a layer for each, and no word on it."""
-    found: dict[str, tuple[int, int]] = {}
+    found: dict[tuple[int, int], str] = {}
     for field, name in header.items():
         number = re.fullmatch(r"Segment(\d+)_Name", field)
         if number is None:
@@ -270,9 +394,7 @@ def _segment_names(path: Path, header: Mapping[str, Any], layers: int) -> dict[s
         value = int(header.get(f"Segment{number.group(1)}_LabelValue", 1))
         if not 0 <= layer < layers:
             raise FileError(f"{path}: expected the layer of segment {name!r} in 0..{layers - 1}, got {layer}.")
-        if name in found:
-            raise FileError(f"{path}: expected each name once, got two segments {name!r}; rename one.")
-        found[str(name)] = (layer, value)
+        found[(layer, value)] = str(name)
     return found
 
 
