@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 import click
 from threadpoolctl import threadpool_limits
 
-from softtwin.meshes.attachment import File, parse_file, parse_regions
+from softtwin.meshes.attachment import File, parse_file, parse_region, parts_of
 from softtwin.meshes.io import Axes, Unit, is_segmentation, stated_axes, stated_unit
 from softtwin.reference.ranks import FailedElsewhere
 
@@ -382,8 +382,23 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
 @click.argument("surface_or_mesh", type=_PATH)
 @flags(
     BodySection,
-    ("unit", "frame", "fixed", "observed", "zones", "inner", "nodes", "organ", "fixed_distance", "cell_size", "grid"),
-    unset=("unit", "frame"),
+    (
+        "unit",
+        "frame",
+        "fixed",
+        "observed",
+        "zones",
+        "inner",
+        "nodes",
+        "organ",
+        "join",
+        "component",
+        "cavities",
+        "fixed_distance",
+        "cell_size",
+        "grid",
+    ),
+    unset=("unit", "frame", "cavities"),
 )
 @flags(MaterialSection, ("young_modulus", "poisson_ratio", "law"))
 @flags(SamplesSection, ("train", "jacobians", "load_path", "ranks"))
@@ -428,7 +443,9 @@ def build(
         "inner": _labelled(inner) if is_segmentation(parse_file(source).path) else _named("--inner", inner),
         "unit": unit,
         "frame": frame,
-        **{name: given[name] for name in ("nodes", "cell_size", "grid", "fixed_distance")},
+        "join": " + ".join(given["join"]),
+        "cavities": given["cavities"] or "",
+        **{name: given[name] for name in ("nodes", "cell_size", "grid", "fixed_distance", "component")},
     }
     entries = {
         "folder": ".",
@@ -493,9 +510,8 @@ def _stated_unit(source: str) -> Unit | None:
 
 def _resolved(where: str) -> str:
     """The words as they are; a file with its whole path."""
-    regions = parse_regions(where)
-    resolved = [str(replace(r, path=r.path.resolve())) if isinstance(r, File) else "" for r in regions]
-    return " + ".join(file or words.strip() for file, words in zip(resolved, where.split(" + "), strict=True))
+    parts = [(part, parse_region(part)) for part in parts_of(where)]
+    return " + ".join(str(replace(r, path=r.path.resolve())) if isinstance(r, File) else part for part, r in parts)
 
 
 @softtwin.command()

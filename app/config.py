@@ -39,6 +39,19 @@ class BodySection(Section):
         "shape: liver-phantom, propeller, beam",
     )
     organ: str = option("", "label of a segmentation that the body is made from; empty: the liver")
+    join: str = option(
+        "", "labels of a segmentation that are part of the organ, wherever they lie", repeated=True, metavar="LABEL"
+    )
+    component: str = option(
+        "largest",
+        "which component is meant where there are several: largest, left or right (the patient's), 2 for the second "
+        "largest, or near:STRUCTURE",
+    )
+    cavities: Literal["", "keep", "fill"] = option(
+        "",
+        "closed holes inside the organ: keep or fill them all; empty: a surface keeps those that lie inside another "
+        "one, a segmentation those of more than 2 ml and 2 % of the organ",
+    )
     unit: Literal["m", "cm", "mm"] = option("m", "unit of length of the files that state none", basic=True)
     frame: Literal["", "lps", "ras"] = option(
         "", "axes of the files that state none, lps or ras; files in ras are rotated, inside it is lps"

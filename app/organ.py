@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from softtwin.meshes.attachment import (
     turned,
 )
 from softtwin.meshes.body import Body, BodyError, Surface
+from softtwin.meshes.components import check_component
 from softtwin.meshes.embedding import embed
 from softtwin.meshes.grid import gridded
 from softtwin.meshes.io import (
@@ -39,6 +40,7 @@ from softtwin.meshes.io import (
     read_surface,
     stated_axes,
     stated_unit,
+    unit_advice,
 )
 from softtwin.meshes.shapes import beam, liver_phantom, propeller
 from softtwin.meshes.solidify import solidify
@@ -52,7 +54,6 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 SHAPES: dict[str, Callable[..., Body]] = {"liver-phantom": liver_phantom, "propeller": propeller, "beam": beam}
 _COARSEST = 0.2  # of the body's size: the edge of a grid's cells
-_MOSTLY = 0.5  # of an inner surface's vertices: more outside the body, and it belongs to another one
 _LONG = 2.0  # edges of a mesh of n nodes in a volume V are shorter than this times (V / n)^(1/3)
 _TOUCHING = 1e-3  # of the body's size: nearer to it a point outside is round-off of the mesh
 
@@ -103,6 +104,7 @@ def make_organ(section: BodySection, root: Path) -> Organ:
         RegionError, FileError, SurfaceError, BodyError, ConfigError: what is wrong with the input. What can be seen
             before a surface is made solid is said before.
     """
+    check_component(section.component)
     regions = _checked_regions(section, root)
     notes: list[str] = []
     scan = _scan(section, root, regions)
@@ -183,7 +185,7 @@ def _checked_regions(section: BodySection, root: Path) -> dict[str, tuple[Region
         )
     texts = {"fixed": section.fixed, "observed": section.observed}
     texts |= {f"zones.{name}": text for name, text in section.zones.items()}
-    regions = {name: parse_regions(text, section.unit) if text else () for name, text in texts.items()}
+    regions = {name: parse_regions(text, section.unit, root) if text else () for name, text in texts.items()}
     if files_axes(section) == "ras":
         regions = {name: tuple(map(turned, group)) for name, group in regions.items()}
     structures = (*section.inner, *_OWN_STRUCTURES.get(section.source, ()))
@@ -211,8 +213,11 @@ def _scan(section: BodySection, root: Path, regions: Mapping[str, tuple[Region, 
         from .scan import open_scan  # a twin from a volume mesh is built where nibabel is not installed
 
         return open_scan(section, root, every)
-    if section.organ:
-        raise ConfigError(f"body.organ: expected a segmentation as source, got {section.source}; it has no labels.")
+    for name in ("organ", "join"):
+        if getattr(section, name):
+            raise ConfigError(
+                f"body.{name}: expected a segmentation as source, got {section.source}; it has no labels."
+            )
     if any(isinstance(region, Touching) for region in every):
         raise ConfigError(
             f"touching: expected a segmentation as source, got {section.source}; near: and ball: are known of it."
@@ -242,10 +247,12 @@ def _solid(section: BodySection, reader: _Reader, source: File) -> tuple[Volume,
         return found, list(found.said)
     if reader.scan is not None:
         reader.scan.check_touching(found, section.cell_size or _LONG * float(np.cbrt(found.volume / section.nodes)))
+    # What a segmentation has of components and holes was chosen among its voxels.
+    options: dict[str, Any] = {"cavities": section.cavities, "component": section.component} if not reader.scan else {}
     if section.cell_size > 0.0:
-        solid = solidify(found, cell_size=section.cell_size)
+        solid = solidify(found, cell_size=section.cell_size, **options)
     else:
-        solid = solidify(found, node_count=section.nodes)
+        solid = solidify(found, node_count=section.nodes, **options)
     made = Volume(solid.points, solid.cells, np.arange(len(solid.points)))
     return made, said + str(solid.mending).splitlines()
 
@@ -254,27 +261,28 @@ def _check_size(path: Path, size: float, unit: Unit) -> None:
     if not SMALLEST <= size <= LARGEST:
         raise FileError(
             f"{path}: expected an organ of {1e3 * SMALLEST:g} mm to {LARGEST:g} m, got {size:.3g} m across when read "
-            f"in {unit}; if it is in another unit, say so with --unit (m, cm or mm)."
+            f"in {unit}; {unit_advice(size, unit)}."
         )
 
 
 def _outside(body: Body, name: str, surface: Surface) -> list[str]:
-    """What to say of an inner surface that does not lie inside.
+    """What to say of an inner surface that does not lie inside: its part outside is carried along, not tracked.
 
     Raises:
-        BodyError: most of it lies outside.
+        BodyError: no part of it lies inside.
     """
     outside = embed(body, surface.points).outside
     share = float((outside > _TOUCHING * body.size).mean())
-    if share > _MOSTLY:
+    if share == 1.0:
         raise BodyError(
-            f"body.inner.{name}: expected a surface inside the organ, got {100 * share:.0f} % of its vertices outside, "
+            f"body.inner.{name}: expected a surface inside the organ, got all of its vertices outside, "
             f"up to {1e3 * outside.max():.1f} mm; has its file another unit (FILE:mm) or other axes (FILE:ras)?"
         )
     if share > 0:
         return [
             f"warning: {name}: {100 * share:.1f} % of its vertices lie outside the organ, up to "
-            f"{1e3 * outside.max():.1f} mm; they move with the nearest point of the boundary"
+            f"{1e3 * outside.max():.1f} mm; they move with the nearest point of the boundary, where they really are is "
+            f"not known; a label of a segmentation becomes part of the organ with --join {name}"
         ]
     return []
 

@@ -94,7 +94,8 @@ def _files_of(name: str) -> list[Path]:
         if not found:
             raise FileError(f"{path}: expected clouds in this folder ({', '.join(CLOUDS)}), found none.")
     elif glob.has_magic(name):
-        found = [Path(file) for file in glob.glob(name, recursive=True)]
+        within = glob.escape(str(path.parent)) if path.parent.is_dir() else str(path.parent)
+        found = [Path(file) for file in glob.glob(f"{within}/{path.name}", recursive=True)]
         found = [file for file in found if file.is_file() and not is_companion(file)]
         if not found:
             raise FileError(f"{name}: expected a pattern of files, found none that matches.")

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from softtwin.meshes.attachment import File, Region, RegionError, Touching, parse_file
+from softtwin.meshes.attachment import File, Region, RegionError, Touching, parse_file, parts_of
 from softtwin.meshes.body import Floats, Surface
-from softtwin.meshes.io import Axes, Unit
+from softtwin.meshes.components import Cavities
+from softtwin.meshes.io import METRES, Axes, Unit
 from softtwin.meshes.segmentation import (
     Segmentation,
     distances_to,
@@ -37,12 +38,18 @@ class Scan:
         organ: the label of the body.
         labels: label of each inner structure that is no file, by the structure's name.
         touching: what has to touch the organ.
+        join: labels that are part of the organ.
+        component: which component of the organ is meant.
+        cavities: which of its holes stay; empty for the rule.
     """
 
     segmentation: Segmentation
     organ: str
     labels: Mapping[str, str]
     touching: tuple[Touching, ...] = ()
+    join: tuple[str, ...] = ()
+    component: str = "largest"
+    cavities: Cavities = ""
 
     def surface(self) -> tuple[Surface, list[str]]:
         """The organ's surface, and what to say of it.
@@ -50,7 +57,8 @@ class Scan:
         Raises:
             FileError: it is one voxel thick.
         """
-        return organ_surface(self.segmentation, self.organ, self.labels.values())
+        inner = [label for label in self.labels.values() if label not in self.join]
+        return organ_surface(self.segmentation, self.organ, inner, self.join, self.component, self.cavities)
 
     def inner(self, name: str) -> tuple[Surface, list[str]]:
         """The surface of an inner structure, and what to say of it.
@@ -121,11 +129,17 @@ def open_scan(section: BodySection, root: Path, regions: Iterable[Region]) -> Sc
     """
     path = root / parse_file(section.source).path
     _check_frame(section, path)
-    segmentation = read_segmentation(path, files_axes(section))
+    segmentation = read_segmentation(path, files_axes(section), parse_file(section.source).unit)
     inner = {name: text for name, text in section.inner.items() if not (root / parse_file(text).path).is_file()}
     touching = tuple(region for region in regions if isinstance(region, Touching))
-    scan = Scan(segmentation, section.organ or the_organ(segmentation), inner, touching)
-    for label in (scan.organ, *inner.values(), *(region.label for region in touching)):
+    join = tuple(inner.get(name, name) for name in parts_of(section.join))
+    component = section.component.strip()
+    if component.startswith("near:"):
+        near = component.removeprefix("near:")
+        component = f"near:{inner.get(near, near)}"
+    organ = section.organ or the_organ(segmentation)
+    scan = Scan(segmentation, organ, inner, touching, join, component, section.cavities)
+    for label in (scan.organ, *inner.values(), *join, *(region.label for region in touching)):
         find(segmentation, label)
     return scan
 
@@ -133,34 +147,42 @@ def open_scan(section: BodySection, root: Path, regions: Iterable[Region]) -> Sc
 def framed(source: str, unit: Unit | None, frame: Axes | None) -> tuple[str, Unit, Axes]:
     """Source with its whole path and axes, unit and axes, as a segmentation says them itself.
 
+    A unit that the user says wins over the file's: it stands behind the source then.
+
     Args:
         source: file or folder, with unit and axes behind it or not.
         unit: that the user says.
         frame: axes that the user says.
 
     Raises:
-        ConfigError: the user says something else than the file, or nobody says the axes.
+        ConfigError: the user says other axes than the file, or nobody says the axes.
         FileError: it cannot be read.
     """
     file = parse_file(source)
-    stated, axes = frame_of(file.path)
-    for flag, told, said in (("--unit", file.unit or unit, stated), ("--frame", file.axes or frame, axes)):
-        if told and said and told != said:
-            raise ConfigError(
-                f"{flag}: expected {said}, which {file.path} says of itself, got {told}. Coordinates are in the file's "
-                "own unit and axes; other files have theirs behind the name (veins.ply:cm:lps)."
-            )
-    found = axes or file.axes or frame
+    stated, axes, scale = frame_of(file.path)
+    told, turned = file.unit or unit, file.axes or frame
+    if turned and axes and turned != axes:
+        raise ConfigError(
+            f"--frame: expected {axes}, which {file.path} says of itself, got {turned}. Coordinates are on the file's "
+            "own axes; other files have theirs behind the name (veins.ply:cm:lps)."
+        )
+    found = axes or turned
     if found is None:
         raise ConfigError(f"--frame: expected lps or ras, since {file.path} says no space of its own.")
-    return str(File(file.path.resolve(), None, found)), stated, found
+    forced = told if told and METRES[told] != scale else None
+    return str(File(file.path.resolve(), forced, found)), forced or stated, found
 
 
 def _check_frame(section: BodySection, path: Path) -> None:
     """Refuse a configuration that says something else than its source: clouds would be read otherwise later."""
-    unit, axes = frame_of(path)
-    if section.unit != unit:
-        raise ConfigError(f'body.unit: {path} is in {unit}, got {section.unit!r}; write unit = "{unit}".')
+    stated, axes, _ = frame_of(path)
+    forced = parse_file(section.source).unit
+    if section.unit != (unit := forced or stated):
+        told = File(parse_file(section.source).path, section.unit, files_axes(section))
+        raise ConfigError(
+            f'body.unit: {path} is in {unit}, got {section.unit!r}; write unit = "{unit}", or, where the file is wrong '
+            f'about itself, source = "{told}".'
+        )
     if axes and files_axes(section) != axes:
         written = File(parse_file(section.source).path, None, axes)
         raise ConfigError(f'body.source: {path} is in {axes.upper()}, expected source = "{written}".')

@@ -1,4 +1,4 @@
-"""Parts of a body said in words: near an inner structure, in a ball, a box, a half-space, seen from a place, in a file.
+"""Parts of a body said in words: near an inner structure, in a ball, a box, a half-space, seen from somewhere, a file.
 
 A region is a value; what of a body lies in it are nodes and triangles of the boundary. In text (lengths without a unit
 are in a unit that the caller names, the place's unit stands behind its last number):
@@ -11,6 +11,7 @@ are in a unit that the caller names, the place's unit stands behind its last num
     touching:vena_cava:5mm          where another label of the segmentation touches the organ; without a distance:
                                     a voxel's diagonal, or one cell where that reaches too few nodes
     veins.ply, veins.ply:mm:ras     near the points of a file, with its unit and axes where it has others
+    "a + b.ply":mm                  the same in double quotes, where ` + ` or `:` belongs to the name
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ Vector = tuple[float, float, float]
 Flags = NDArray[np.bool_]
 WORDS = ("near", "touching", "ball", "box", "halfspace", "seen-from")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_QUOTED = re.compile(r'"((?:[^"\\]|\\.)*)"((?::\w+)*)')
+_JOINT = re.compile(r'"(?:[^"\\]|\\.)*"| \+ ')
 _LENGTH = re.compile(rf"\s*({_NUMBER})\s*([a-z]*)\s*")
 
 
@@ -111,7 +114,7 @@ class File:
     axes: Axes | None = None
 
     def __str__(self) -> str:
-        return ":".join(map(str, filter(None, (self.path, self.unit, self.axes))))
+        return ":".join(filter(None, (_quoted(self.path), self.unit, self.axes)))
 
 
 Shape = Near | Ball | Box | HalfSpace | SeenFrom
@@ -129,7 +132,7 @@ def parse_region(text: str, unit: Unit = "m") -> Region:
         RegionError: what was expected and what came.
     """
     word, *parts = text.split(":")
-    if word not in WORDS:
+    if word not in WORDS or Path(text).exists():
         return parse_file(text)
     try:
         return _parse_shape(word, parts, unit)
@@ -137,17 +140,60 @@ def parse_region(text: str, unit: Unit = "m") -> Region:
         raise RegionError(f"{text!r}: {error}") from None
 
 
-def parse_regions(text: str, unit: Unit = "m") -> tuple[Region, ...]:
+def parse_regions(text: str, unit: Unit = "m", root: Path = Path()) -> tuple[Region, ...]:
     """The regions of a text, whose union is meant: ` + ` stands between them.
 
     Args:
         text: the description.
         unit: of lengths without a unit of their own.
+        root: folder that relative paths start from.
 
     Raises:
         RegionError: what was expected and what came.
     """
-    return tuple(parse_region(part.strip(), unit) for part in text.split(" + "))
+    return tuple(parse_region(part, unit) for part in parts_of(text, root))
+
+
+def parts_of(text: str, root: Path = Path()) -> tuple[str, ...]:
+    """The parts between which ` + ` stands, none of them empty.
+
+    What is in double quotes is one part, and so is a text that names a file that is there.
+
+    Args:
+        text: the description.
+        root: folder that relative paths start from.
+    """
+    if text.strip() and (root / _without_unit(text.strip())[0]).exists():
+        return (text.strip(),)
+    places = [found.start() for found in _JOINT.finditer(text) if found.group() == " + "]
+    ends = [0, *(place + 3 for place in places)]
+    parts = [text[low:high] for low, high in zip(ends, [*places, len(text)], strict=True)]
+    return tuple(part.strip() for part in parts if part.strip())
+
+
+def _without_unit(text: str) -> tuple[str, str | None, str | None]:
+    """A path without quotes, and the unit and axes behind it."""
+    quoted = _QUOTED.fullmatch(text)
+    path, rest = (re.sub(r"\\(.)", r"\1", quoted.group(1)), quoted.group(2)) if quoted else (text, None)
+    unit = axes = None
+    words = path if rest is None else rest
+    while (rest is not None or not Path(words).exists()) and ":" in words:
+        first, _, last = words.rpartition(":")
+        if last in UNITS and unit is None:
+            words, unit = first, last
+        elif last.lower() in AXES and axes is None:
+            words, axes = first, last.lower()
+        else:
+            break
+    return (words if rest is None else path + words), unit, axes
+
+
+def _quoted(path: Path) -> str:
+    """A path as text that `parse_regions` reads as this path."""
+    plain = str(path)
+    if not any(mark in plain for mark in (" + ", ":", '"', "\\")) and plain == plain.strip():
+        return plain
+    return '"' + re.sub(r'(["\\])', r"\\\1", plain) + '"'
 
 
 def turned(region: Region) -> Region:
@@ -173,21 +219,15 @@ def _turned(vector: Vector) -> Vector:
 def parse_file(text: str) -> File:
     """The file that a text names: a path, with `:mm`, `:lps` or both behind it where its unit or axes differ.
 
+    A path may stand in double quotes; one that is there as it is written is taken so.
+
     Args:
         text: the description.
 
     Raises:
         RegionError: unit or axes are given twice, or there is no path.
     """
-    path, unit, axes = text, None, None
-    while not Path(path).exists() and ":" in path:
-        rest, _, last = path.rpartition(":")
-        if last in UNITS and unit is None:
-            path, unit = rest, last
-        elif last.lower() in AXES and axes is None:
-            path, axes = rest, last.lower()
-        else:
-            break
+    path, unit, axes = _without_unit(text.strip())
     if not path:
         raise RegionError(f"{text!r}: expected a file, with :m, :cm, :mm, :lps or :ras behind it where it has another "
                           "unit or axes.")  # fmt: skip

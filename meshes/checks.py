@@ -14,6 +14,8 @@ from vtkmodules.vtkFiltersCore import vtkPolyDataNormals
 
 from .body import Floats, Ints, Surface
 from .closest import polydata
+from .components import Cavities
+from .nesting import nesting
 
 _log = logging.getLogger(__name__)
 _COINCIDENT = 1e-6  # of the surface's size: vertices nearer to each other are one; coordinates in single precision hold
@@ -38,6 +40,9 @@ class Defects:
         clashing_edges: edges whose two triangles wind against each other.
         pieces: components that share no vertex.
         winds_inward: True where the surface as a whole is inside out.
+        cavities: volumes of closed components that lie inside others, largest first, cubic metres.
+        misleading: True where one of these winds like a solid.
+        filled: whether they were filled.
     """
 
     merged_vertices: int
@@ -48,16 +53,20 @@ class Defects:
     clashing_edges: int
     pieces: int
     winds_inward: bool
+    cavities: tuple[float, ...] = ()
+    misleading: bool = False
+    filled: bool = False
 
 
-def put_in_order(surface: Surface) -> tuple[Surface, Defects]:
+def put_in_order(surface: Surface, cavities: Cavities = "") -> tuple[Surface, Defects]:
     """The surface with shared vertices, one winding (outward) and flat lids over its holes, and what was wrong with it.
 
-    Nothing is guessed that only a mesher can settle: sheets without an inside, crowded edges and self-intersections
-    stay.
+    A closed component inside another bounds a cavity, whichever way it winds (see `nesting`). Nothing is guessed that
+    only a mesher can settle: sheets without an inside, crowded edges and self-intersections stay.
 
     Args:
         surface: triangle surface, metres.
+        cavities: fill them, or keep them, which is also what happens where nothing is said.
 
     Raises:
         SurfaceError: no triangle is left.
@@ -70,6 +79,8 @@ def put_in_order(surface: Surface) -> tuple[Surface, Defects]:
     rims = _open_edges(wound.triangles)
     lidded = _lidded(wound, rims)
     inward = lidded.volume < 0
+    ordered = Surface(lidded.points, lidded.triangles[:, ::-1]) if inward else lidded
+    ordered, hollow, misled = _nested(ordered, cavities)
     defects = Defects(
         merged_vertices=len(surface.points) - len(shared.points),
         degenerate_triangles=len(surface.triangles) - len(distinct.triangles),
@@ -79,8 +90,32 @@ def put_in_order(surface: Surface) -> tuple[Surface, Defects]:
         clashing_edges=clashing,
         pieces=int(piece_numbers(distinct).max()) + 1,
         winds_inward=inward,
+        cavities=hollow,
+        misleading=misled and not clashing,
+        filled=cavities == "fill",
     )
-    return (Surface(lidded.points, lidded.triangles[:, ::-1]) if inward else lidded), defects
+    return ordered, defects
+
+
+def _nested(surface: Surface, cavities: Cavities) -> tuple[Surface, tuple[float, ...], bool]:
+    """Components wound as they lie in each other, volumes of the cavities, and whether one wound like a solid."""
+    vertices = piece_numbers(surface)
+    pieces = vertices[surface.triangles[:, 0]]
+    count = int(pieces.max()) + 1
+    if count == 1:
+        return surface, (), False
+    is_closed = np.ones(count, dtype=np.bool_)
+    is_closed[vertices[_open_edges(surface.triangles)[:, 0]]] = False
+    found = nesting(surface, pieces, is_closed)
+    if not found.is_cavity.any():
+        return surface, (), False
+    volumes = tuple(np.sort(found.volumes[found.is_cavity])[::-1].tolist())
+    misled = bool((found.is_cavity & ~found.is_inward).any())  # the outermost component winds outward by now
+    if cavities == "fill":
+        return compacted(Surface(surface.points, surface.triangles[(found.depths == 0)[pieces]])), volumes, misled
+    turned = found.is_known & (found.is_inward != found.is_cavity)
+    flipped = np.where(turned[pieces][:, None], surface.triangles[:, ::-1], surface.triangles)
+    return Surface(surface.points, flipped), volumes, misled
 
 
 def merged(surface: Surface) -> Surface:

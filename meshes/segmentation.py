@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from .body import Floats, Surface
 from .components import CAVITY_SHARE, CAVITY_VOLUME, Cavities, ComponentError, chosen_component, dropped_line
-from .io import SEGMENTATIONS, Axes, FileError, Unit, structure_files
+from .io import METRES, SEGMENTATIONS, Axes, FileError, Unit, structure_files
 from .io.labels import LabelMap, read_labelmap, stated_frame
 from .voxels import Voxels, boxed, inside_part, smooth_surface, thick_share, without_crumbs
 
@@ -92,8 +92,8 @@ class Segmentation:
         return ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
 
 
-def frame_of(path: str | Path) -> tuple[Unit, Axes | None]:
-    """Unit and axes that a segmentation says it is in, from headers alone.
+def frame_of(path: str | Path) -> tuple[Unit, Axes | None, float]:
+    """Unit of coordinates beside a segmentation, its axes, and metres in its own unit, from headers alone.
 
     Args:
         path: file or folder.
@@ -119,9 +119,11 @@ def read_segmentation(path: str | Path, axes: Axes | None = None, unit: Unit | N
     path = Path(path)
     if path.is_dir():
         files = _files(path)
-        said, stated = stated_frame(files[0])
+        said, stated, scale = stated_frame(files[0])
         structures = tuple(Structure(_stem(file), file) for file in files)
-        notes = () if unit in (None, said) else (f"warning: {path} says that it is in {said}; {unit} was taken",)
+        notes: tuple[str, ...] = ()
+        if unit is not None and METRES[unit] != scale:
+            notes = (f"warning: {path} says that a unit is {scale:g} m; {unit} was taken, as you say",)
         return Segmentation(path, unit or said, stated or axes or "lps", structures, None, notes, unit)
     volume = read_labelmap(path, axes, unit)
     structures = _structures(volume)

@@ -12,9 +12,11 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkFiltersCore import vtkQuadricDecimation
 
 from .body import Floats, Ints, Surface
-from .checks import Defects, SurfaceError, compacted, piece_numbers, put_in_order
+from .checks import Defects, SurfaceError, compacted, merged, piece_numbers, put_in_order
 from .closest import distances, polydata
+from .components import Cavities, ComponentError, chosen_component
 from .metrics import cell_volumes, tetrahedron_quality
+from .nesting import nesting
 from .smoothing import Flags, improved, outer_faces, used_points
 from .tetwild import tetrahedra
 
@@ -66,6 +68,11 @@ class Mending:
             (d.crowded_edges, f"{d.crowded_edges} edges of more than two triangles resolved"),
             (d.clashing_edges, f"{d.clashing_edges} edges between triangles of opposite winding: turned alike"),
             (d.winds_inward, "triangles wound inward: turned outward"),
+            (
+                len(d.cavities),
+                f"{len(d.cavities)} cavities (closed surfaces inside others) of "
+                f"{1e6 * sum(d.cavities):.4g} ml {'filled' if d.filled else 'stay open; --cavities fill fills them'}",
+            ),
             (len(self.dropped), f"{len(self.dropped)} components left out, the largest {_millilitres(self.dropped)}"),
         ]
         lines = [line for holds, line in said if holds] or ["nothing was wrong with the surface"]
@@ -76,11 +83,17 @@ class Mending:
             f"moved at most {1e3 * self.distance:.2f} mm, {1e3 * self.mean_distance:.3f} mm on average",
         ]
         lines = [f"surface: {line}" for line in lines]
+        if d.misleading and not d.filled:
+            lines.append(
+                "warning: an inner surface winds outward like the outer one; that it lies inside makes it a cavity. If "
+                "what it encloses is solid (a tumour), say --cavities fill, and give it as --inner from a file of its "
+                "own"
+            )
         lost = sum(map(abs, self.dropped)) / self.volume_before
         if lost > _LARGE_PART:
             lines.append(
-                f"warning: {100 * lost:.0f} % of the surface's volume is in components that were left out; where the "
-                "file holds several organs, give one a file"
+                f"warning: {100 * lost:.0f} % of the surface's volume is in components that were left out; "
+                "--component left, right or 2 takes another one"
             )
         return "\n".join(lines)
 
@@ -100,16 +113,25 @@ class Solid:
     mending: Mending
 
 
-def solidify(surface: Surface, cell_size: float | None = None, node_count: int | None = None) -> Solid:
+def solidify(
+    surface: Surface,
+    cell_size: float | None = None,
+    node_count: int | None = None,
+    cavities: Cavities = "",
+    component: str = "largest",
+) -> Solid:
     """Tetrahedra that fill what a surface encloses, whatever its defects: holes, crumbs, overlaps, any winding.
 
-    Of several components the largest is kept. The mesh is another one at each call (see `tetwild.tetrahedra`).
+    Of several components one is kept. The mesh is another one at each call (see `tetwild.tetrahedra`).
 
     Args:
         surface: triangle surface, metres.
         cell_size: wanted mean edge length, metres. Give this or `node_count`.
         node_count: wanted number of nodes; the edge length is searched until the number is met within 15 %, with
             at most 5 meshes (the number reached is the length of the points returned, and is logged).
+        cavities: fill closed components inside others, or keep them as cavities, as is done where nothing is said.
+        component: `largest`, or which of several that lie apart is meant (see `components.check_component`; near: has
+            no meaning here).
 
     Raises:
         SurfaceError: no solid came, or only one with slivers.
@@ -117,7 +139,7 @@ def solidify(surface: Surface, cell_size: float | None = None, node_count: int |
             `MAXIMUM_NODES`.
     """
     _check_wish(cell_size, node_count)
-    ordered, defects = put_in_order(surface)
+    ordered, defects = put_in_order(_component(surface, component), cavities)
     if not ordered.volume > 0:
         raise SurfaceError(
             "surface: expected triangles that enclose a volume, got none; is it a sheet, or open on one side?"
@@ -135,6 +157,26 @@ def solidify(surface: Surface, cell_size: float | None = None, node_count: int |
             f"{worst:.2g}; try another number of nodes or cell size."
         )
     return Solid(points, cells, _mending(ordered, defects, points, cells))
+
+
+def _component(surface: Surface, component: str) -> Surface:
+    """The component that words mean, with what lies inside it."""
+    if component.strip() == "largest":
+        return surface
+    whole = compacted(merged(surface))
+    vertices = piece_numbers(whole)
+    pieces = vertices[whole.triangles[:, 0]]
+    count = int(pieces.max()) + 1
+    found = nesting(whole, pieces, np.ones(count, dtype=np.bool_))
+    tops = np.flatnonzero(found.depths == 0)
+    middles = np.array([whole.points[vertices == top].mean(axis=0) for top in tops])
+    chosen = tops[chosen_component(component, found.volumes[tops], middles, _no_structure, "the surface")]
+    inside = [k for k in range(count) if k == chosen or (found.depths[k] > 0 and found.holders[k] == chosen)]
+    return compacted(Surface(whole.points, whole.triangles[np.isin(pieces, inside)]))
+
+
+def _no_structure(name: str) -> Floats:
+    raise ComponentError(f"--component near:{name}: expected a segmentation as source; a surface knows no labels.")
 
 
 def check_node_count(surface: Surface, cell_size: float) -> None:

@@ -26,6 +26,7 @@ from .common import (
     is_labelmap,
     is_segmentation,
     structure_files,
+    unit_advice,
 )
 from .formats.vtk import add_words, unstructured_grid, vtk_messages
 from .raw import stated_axes, stated_unit
@@ -64,6 +65,7 @@ __all__ = [
     "stated_axes",
     "stated_unit",
     "structure_files",
+    "unit_advice",
     "unstructured_grid",
     "vtk_messages",
     "write_body",

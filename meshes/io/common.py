@@ -18,7 +18,8 @@ Axes = Literal["lps", "ras"]
 UNITS: tuple[str, ...] = get_args(Unit)
 AXES: tuple[str, ...] = get_args(Axes)
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-LARGEST, SMALLEST = 2.0, 5e-3  # metres: an organ outside these was read in the wrong unit
+LARGEST, SMALLEST = 1.0, 5e-3  # metres: an organ outside these was read in the wrong unit
+_USUAL = 0.15  # metres: where two units fit, the one in which the organ is nearer to this
 SEGMENTATIONS = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 TURN = np.array([-1.0, -1.0, 1.0])  # from RAS to LPS and back
 HEAD = 2048  # bytes in which a file says what it is
@@ -153,11 +154,24 @@ def placed(path: Path, points: Floats, unit: Unit, axes: Axes, smallest: float) 
 def _warn_size(path: Path, size: float, unit: Unit, smallest: float) -> None:
     if smallest <= size <= LARGEST or not np.isfinite(size):
         return
-    fits = [u for u, m in METRES.items() if smallest <= size * m / METRES[unit] <= LARGEST]
-    flag = f"--unit {fits[-1]}" if fits else "--unit"
     warnings.warn(
         f"{path} is {size:.3g} m across when read in {unit}, outside the {SMALLEST * 1e3:g} mm to {LARGEST:g} m of "
-        f"an organ; if it is in another unit, say so with {flag}.",
+        f"an organ; {unit_advice(size, unit)}.",
         UnitWarning,
         stacklevel=4,
     )
+
+
+def unit_advice(size: float, unit: Unit) -> str:
+    """Which unit a file of a size that no organ has is probably in.
+
+    Args:
+        size: what it was read as, metres.
+        unit: in which it was read.
+    """
+    sizes = {other: size / METRES[unit] * metres for other, metres in METRES.items() if other != unit}
+    fits = [other for other, metres in sizes.items() if SMALLEST <= metres <= LARGEST]
+    if not fits:
+        return "it fits in no unit (--unit m, cm or mm): is it an organ?"
+    likely = min(fits, key=lambda other: abs(np.log(sizes[other] / _USUAL)))
+    return f"say --unit {likely}, in which it is {1e3 * sizes[likely]:.3g} mm"

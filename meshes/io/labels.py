@@ -86,13 +86,14 @@ def read_labelmap(path: str | Path, axes: Axes | None = None, unit: Unit | None 
     """
     with _reading(path := Path(path)):
         found = _reader(path)(path, axes)
-    return found if unit is None or (unit == found.unit and found.scale == METRES[unit]) else _in_unit(found, unit)
+    return found if unit is None or found.scale == METRES[unit] else _in_unit(found, unit)
 
 
 def _in_unit(volume: LabelMap, unit: Unit) -> LabelMap:
     place = volume.to_lps.copy()
     place[:3] *= METRES[unit] / volume.scale
-    note = f"warning: {volume.path} says that it is in {volume.unit}; --unit {unit} was taken, as you say"
+    said = next((name for name, metres in METRES.items() if metres == volume.scale), "micrometres")
+    note = f"warning: {volume.path} says that it is in {said}; {unit} was taken, as you say"
     return replace(volume, to_lps=place, unit=unit, scale=METRES[unit], notes=(*volume.notes, note))
 
 
@@ -101,8 +102,10 @@ def _reader(path: Path) -> Callable[[Path, Axes | None], LabelMap]:
     return _read_nrrd if suffix in _NRRD else _read_meta if suffix in _META else _read_nifti
 
 
-def stated_frame(path: str | Path) -> tuple[Unit, Axes | None]:
-    """Unit and axes that a file says it is in, from its header alone; None for no axes.
+def stated_frame(path: str | Path) -> tuple[Unit, Axes | None, float]:
+    """What a file says it is in, from its header alone: unit of coordinates beside it, axes (None for none), its scale.
+
+    The scale is metres in the unit of its own numbers, which are micrometres at times.
 
     Args:
         path: as for `read_labelmap`.
@@ -114,11 +117,13 @@ def stated_frame(path: str | Path) -> tuple[Unit, Axes | None]:
         if path.suffix.lower() in _NRRD:
             header = nrrd.read_header(str(path))
             space = _nrrd_space(path, header)
-            return _nrrd_unit(path, header)[1], None if space is None else _axes_beside(space)
+            scale, unit = _nrrd_unit(path, header)
+            return unit, None if space is None else _axes_beside(space), scale
         if path.suffix.lower() in _META:
             _meta_header(path)
-            return "mm", "lps"
-        return _nifti_unit(path, nibabel.load(path).header)[1], "ras"
+            return "mm", "lps", METRES["mm"]
+        scale, unit = _nifti_unit(path, nibabel.load(path).header)
+        return unit, "ras", scale
 
 
 @contextmanager
