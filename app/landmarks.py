@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.io import FileError
+from softtwin.meshes.io import TURN, FileError
+from softtwin.meshes.io.landmarks import SUFFIXES, read_named_points
 from softtwin.registration.landmarks import LandmarkPairs
-from softtwin.registration.pose import LandmarkFit, from_landmarks, read_landmarks
+from softtwin.registration.pose import LandmarkFit, from_landmarks
 
 from .config import ConfigError
 from .record import millimetres
 from .twin import Twin
 
 Floats = NDArray[np.float64]
-SUFFIXES = (".csv", ".txt", ".fcsv", ".mrk.json", ".json")
 
 
 def camera_from_landmarks(body: Path, camera: Path, inside: Coordinates, clouds: Coordinates) -> LandmarkFit:
@@ -134,7 +134,8 @@ class LandmarkFiles:
 
 
 def _read(path: Path, coordinates: Coordinates) -> dict[str, Floats]:
-    turned = read_landmarks(path, coordinates.unit, "lps")
-    if path.suffix.lower() in (".fcsv", ".json"):
-        return turned  # these say their axes themselves
-    return {name: coordinates.directions(place) for name, place in turned.items()}
+    found = read_named_points(path, coordinates.unit)
+    if found.axes is None:
+        return {name: coordinates.directions(place) for name, place in found.points.items()}
+    turn = TURN if found.axes == "ras" else np.ones(3)
+    return {name: turn * place for name, place in found.points.items()}

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from softtwin.meshes.export import PER_METRE
-from softtwin.meshes.io import Axes, FileError, Unit
+from softtwin.meshes.io import TURN, Axes, FileError, Unit
+from softtwin.meshes.io.landmarks import read_named_points
+from softtwin.meshes.io.transforms import read_transform
 
 Floats = NDArray[np.float64]
 
 _ORTHOGONAL = 1e-3  # how far R R^T may be from one: matrices come typed by hand with four digits
 _FLAT = 1e-2  # landmarks are in a line when their second extent is below this part of the first
-_TURN = np.array([-1.0, -1.0, 1.0])  # from RAS to LPS and back
-_ITK = ("AffineTransform", "MatrixOffsetTransformBase")
 
 
 class PoseError(ValueError):
@@ -181,164 +178,34 @@ def read_matrix(path: str | Path, unit: Unit = "m") -> Pose:
     shown back to where it rests: it is inverted here, so that the transform that moves the model in Slicer is the pose.
 
     Args:
-        path: 4 x 4 numbers as TXT, CSV, NPY or JSON (rows, or an object with `matrix`), or an affine `.tfm`.
+        path: 4 x 4 numbers as TXT, CSV, NPY or JSON, or a linear `.tfm` (see `transforms.read_transform`).
         unit: unit of the translation in files other than `.tfm`.
 
     Raises:
         FileError: missing or damaged file, another suffix or kind of transform, or no rigid motion.
     """
-    path = _existing(path)
-    readers = {".npy": _npy_matrix, ".json": _json_matrix, ".tfm": _itk_matrix, ".txt": _table, ".csv": _table}
-    if path.suffix.lower() not in readers:
-        raise FileError(f"{path}: expected a matrix as {', '.join(sorted(readers))}, got suffix {path.suffix!r}.")
-    is_itk = path.suffix.lower() == ".tfm"
+    matrix = read_transform(path, unit)
     try:
-        matrix = np.array(readers[path.suffix.lower()](path), dtype=np.float64)
-        if matrix.shape == (4, 4):
-            matrix[:3, 3] /= _per_metre("mm" if is_itk else unit)
         pose = Pose.from_matrix(matrix)
-    except FileError:
-        raise
     except PoseError as error:
         raise FileError(f"{path}: {error}") from error
-    except (ValueError, TypeError, KeyError, OSError, EOFError) as error:
-        raise FileError(f"{path}: expected a matrix of 4 x 4 numbers ({error}).") from error
-    return pose.inverse() if is_itk else pose
-
-
-def _existing(path: str | Path) -> Path:
-    path = Path(path)
-    if not path.is_file():
-        raise FileError(f"{path}: no such file." if not path.exists() else f"{path}: expected a file, got a folder.")
-    return path
-
-
-def _per_metre(unit: str) -> float:
-    if unit not in PER_METRE:
-        raise FileError(f"unit: expected one of {', '.join(PER_METRE)}, got {unit!r}.")
-    return PER_METRE[unit]
-
-
-def _table(path: Path) -> Any:
-    rows = [line.split() for line in path.read_text().replace(",", " ").replace(";", " ").splitlines()]
-    return [row for row in rows if row and not row[0].startswith("#")]
-
-
-def _npy_matrix(path: Path) -> Any:
-    return np.load(path, allow_pickle=False)
-
-
-def _json_matrix(path: Path) -> Any:
-    content = json.loads(path.read_text())
-    return content["matrix"] if isinstance(content, dict) else content
-
-
-def _itk_matrix(path: Path) -> Any:
-    lines = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line and line[0] != "#")
-    kind = lines.get("Transform", "").strip()
-    if kind.split("_")[0] not in _ITK or not kind.endswith("_3_3"):
-        raise FileError(f"{path}: expected one affine transform in space, got {kind or 'none'!r}; "
-                        "save it as a linear transform, or give its 4 x 4 matrix as text.")  # fmt: skip
-    numbers = np.array(lines["Parameters"].split(), dtype=np.float64)
-    centre = np.array(lines.get("FixedParameters", "0 0 0").split(), dtype=np.float64)
-    matrix = np.eye(4)
-    matrix[:3, :3] = numbers[:9].reshape(3, 3)
-    matrix[:3, 3] = numbers[9:12] + centre - matrix[:3, :3] @ centre
-    return matrix
+    return pose.inverse() if Path(path).suffix.lower() == ".tfm" else pose
 
 
 def read_landmarks(path: str | Path, unit: Unit = "m", axes: Axes | None = None) -> dict[str, Floats]:
     """Named points of a file, each (3,), metres.
 
     Args:
-        path: TXT or CSV with lines `name,x,y,z`, or points that 3D Slicer marked (`.fcsv`, `.mrk.json`).
-        unit: unit of TXT and CSV, and of Slicer's files where they say none other than their millimetres.
+        path: see `landmarks.read_named_points`.
+        unit: of files that state none.
         axes: `lps` or `ras` turns the points of a file that says its axes to these; otherwise they stay as they are.
 
     Raises:
         FileError: missing or damaged file, another suffix, no points, or a name twice; the message names it.
     """
-    path = _existing(path)
-    try:
-        if path.name.lower().endswith(".json"):
-            named, own, unit = _markup_points(path)
-        elif path.suffix.lower() == ".fcsv":
-            named, own, unit = *_fiducials(path), "mm"
-        elif path.suffix.lower() in (".csv", ".txt"):
-            named, own = _named_rows(path), None
-        else:
-            raise FileError(f"{path}: expected landmarks as .csv, .txt, .fcsv or .mrk.json, got {path.suffix!r}.")
-        points = [(name, np.array(place, dtype=np.float64) / _per_metre(unit)) for name, place in named]
-    except FileError:
-        raise
-    except (ValueError, TypeError, KeyError, IndexError, OSError) as error:
-        raise FileError(f"{path}: expected points, each a name with x, y and z ({error}).") from error
-    turn = _TURN if axes is not None and own not in (None, axes) else np.ones(3)
-    return {name: turn * place for name, place in _checked_points(path, points)}
-
-
-_Named = list[tuple[str, Sequence[Any]]]
-
-
-def _named_rows(path: Path) -> _Named:
-    lines = [line.strip() for line in path.read_text().replace(";", ",").splitlines()]
-    rows = [[word.strip() for word in line.split(",")] for line in lines if line and line[0] != "#"]
-    if rows and [word.lower() for word in rows[0][1:]] == ["x", "y", "z"]:
-        rows = rows[1:]
-    wrong = next((row for row in rows if len(row) != 4), None)
-    if wrong is not None:
-        raise ValueError(f"got the line {','.join(wrong)!r}")
-    return [(row[0], row[1:]) for row in rows]
-
-
-def _fiducials(path: Path) -> tuple[_Named, Axes]:
-    said = "0"
-    columns = ["id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label"]
-    rows = []
-    for line in path.read_text().splitlines():
-        if line.startswith("#"):
-            key, _, value = line[1:].partition("=")
-            said = value.strip() if key.strip() == "CoordinateSystem" else said
-            columns = value.strip().split(",") if key.strip() == "columns" else columns
-        elif line.strip():
-            rows.append(dict(zip(columns, line.split(","), strict=False)))
-    named: _Named = [(row["label"], [row["x"], row["y"], row["z"]]) for row in rows]
-    return named, _axes(path, {"0": "RAS", "1": "LPS"}.get(said, said))
-
-
-def _markup_points(path: Path) -> tuple[_Named, Axes, Unit]:
-    markup = json.loads(path.read_text())["markups"][0]
-    points = [point for point in markup["controlPoints"] if point.get("positionStatus", "defined") == "defined"]
-    units = markup.get("coordinateUnits", "mm")
-    unit = _unit(path, units if isinstance(units, str) else units[0])
-    return [(p["label"], p["position"]) for p in points], _axes(path, markup.get("coordinateSystem", "LPS")), unit
-
-
-def _unit(path: Path, said: str) -> Unit:
-    if said in ("m", "cm", "mm"):
-        return said  # type: ignore[return-value]
-    raise FileError(f"{path}: expected points in m, cm or mm, got {said!r}.")
-
-
-def _axes(path: Path, said: str) -> Axes:
-    if said.upper() == "LPS":
-        return "lps"
-    if said.upper() == "RAS":
-        return "ras"
-    raise FileError(f"{path}: expected points in LPS or RAS, got {said!r}.")
-
-
-def _checked_points(path: Path, points: list[tuple[str, Floats]]) -> list[tuple[str, Floats]]:
-    if not points:
-        raise FileError(f"{path}: expected landmarks, got none.")
-    names = [name for name, _ in points]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise FileError(f"{path}: expected each landmark once, got {', '.join(twice)} more than once.")
-    wrong = [name for name, place in points if place.shape != (3,) or not np.isfinite(place).all()]
-    if wrong:
-        raise FileError(f"{path}: expected three finite coordinates, got others for {', '.join(wrong)}.")
-    return points
+    found = read_named_points(path, unit)
+    turn = TURN if axes is not None and found.axes not in (None, axes) else np.ones(3)
+    return {name: turn * place for name, place in found.points.items()}
 
 
 # --- Landmarks.

@@ -11,16 +11,19 @@ import pytest
 for package in ("nibabel", "nrrd", "pytetwild"):
     pytest.importorskip(package, reason="the extra mesh is absent")
 
+import nibabel
 from labels import Grid, ellipsoid, write_nifti, write_nrrd
 
 from softtwin.app import chain
 from softtwin.app.cli import main
 from softtwin.app.config import Config, ConfigError, parse_config
 from softtwin.app.organ import Organ, make_organ
+from softtwin.app.scan import framed
 from softtwin.app.twin import coordinates_of
 from softtwin.meshes.attachment import RegionError
 from softtwin.meshes.body import Body
 from softtwin.meshes.io import FileError, read_volume
+from softtwin.meshes.segmentation import find, read_segmentation, voxels_of
 
 ORGAN = ellipsoid((14.0, -28.0, 218.0), (34.0, 22.0, 27.0))
 TUMOUR = ellipsoid((24.0, -30.0, 222.0), (9.0, 8.0, 8.0))
@@ -101,17 +104,35 @@ def test_words_that_cannot_be_are_refused_before_a_mesh_is_made(files: Path, mon
         make_organ(parse_config({"body": {"fixed": "touching:spleen"}}).body, files)
 
 
+def test_the_unit_that_is_said_wins_over_the_file_and_both_are_named(
+    files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["build", str(files / "total.nii.gz"), "--fixed", "touching:vena_cava", "--unit", "m"])
+    assert "got 68.4 m across when read in m; say --unit mm, in which it is 68.4 mm" in capsys.readouterr().err
+    shrunk = files / "shrunk.nii.gz"
+    image = nibabel.load(files / "total.nii.gz")
+    image.header.set_xyzt_units("micron")
+    nibabel.save(image, shrunk)
+    assert framed(str(shrunk), None, None) == (f"{shrunk}:ras", "mm", "ras")
+    assert framed(str(shrunk), "mm", None) == (f"{shrunk}:mm:ras", "mm", "ras")
+    segmentation = read_segmentation(shrunk, None, "mm")
+    assert "says that it is in micrometres; mm was taken" in segmentation.notes[0]
+    whole = read_segmentation(files / "total.nii.gz")
+    volumes = [voxels_of(one, find(one, "liver")).volume for one in (segmentation, whole)]
+    assert volumes[0] == pytest.approx(volumes[1])
+
+
 @pytest.mark.parametrize(
     ("name", "words", "said"),
     [
-        ("total.nii.gz", ["--unit", "m"], "--unit: expected mm"),
         ("total.nii.gz", ["--frame", "lps"], "--frame: expected ras"),
         ("total.seg.nrrd", ["--frame", "ras"], "--frame: expected lps"),
         ("placeless.nrrd", [], "--frame: expected lps or ras"),
         ("none.nii.gz", [], "no such file"),
     ],
 )
-def test_a_unit_or_frame_that_contradicts_the_file_is_refused(
+def test_a_frame_that_contradicts_the_file_is_refused(
     files: Path, capsys: pytest.CaptureFixture[str], name: str, words: list[str], said: str
 ) -> None:
     with pytest.raises(SystemExit):

@@ -93,9 +93,9 @@ def test_ras_axes_are_turned_and_the_winding_kept(tmp_path: Path, ball: Surface)
 
 def test_millimetres_read_as_metres_warn_with_the_size_and_the_flag(tmp_path: Path, ball: Surface) -> None:
     path = _save(tmp_path / "liver.stl", Surface(2.5 * ball.points, ball.triangles), scale=1000)
-    with pytest.warns(UnitWarning, match=r"liver\.stl is 250 m across when read in m, .* say so with --unit mm"):
+    with pytest.warns(UnitWarning, match=r"liver\.stl is 250 m across when read in m, .*; say --unit mm, .* 250 mm"):
         read_surface(path)
-    with pytest.warns(UnitWarning, match=r"is 2\.5 m across when read in cm"):
+    with pytest.warns(UnitWarning, match=r"is 2\.5 m across when read in cm, .*; say --unit mm, in which it is 250 mm"):
         read_surface(path, unit="cm")
 
 

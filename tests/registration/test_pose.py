@@ -134,12 +134,12 @@ def test_the_transform_that_moves_the_model_in_slicer_is_the_pose(tmp_path: Path
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("start.txt", "1 0 0\n0 1 0\n0 0 1\n", r"start.txt: matrix: expected shape \(4, 4\), got \(3, 3\)"),
+        ("start.txt", "1 0 0\n0 1 0\n0 0 1\n", r"start.txt: expected a matrix of 4 x 4 numbers \(got shape \(3, 3\)\)"),
         ("start.txt", "1 0 0 a\n", "start.txt: expected a matrix of 4 x 4 numbers"),
         ("start.json", "[[1, 0", "start.json: expected a matrix"),
         ("start.json", '{"pose": []}', "start.json: expected a matrix"),
         ("start.xml", "1", "start.xml: expected a matrix as .*suffix '.xml'"),
-        ("start.tfm", "Transform: BSplineTransform_double_3_3\n", "start.tfm: expected one affine .*BSpline"),
+        ("start.tfm", "Transform: BSplineTransform_double_3_3\n", "start.tfm: expected one linear .*BSpline"),
         ("start.csv", "-1,0,0,0\n0,1,0,0\n0,0,1,0\n0,0,0,1\n", "start.csv: rotation: .*mirrors"),
     ],
 )
