@@ -173,9 +173,11 @@ def find(segmentation: Segmentation, name: str) -> tuple[Structure, ...]:
         FileError: none, with those that there are.
     """
     structures, wanted = segmentation.structures, _plain(name)
-    if one := _numbered(structures, name):
+    if one := _numbered(segmentation, name):
         return (one,)
-    exact = [s for s in structures if _plain(s.name) == wanted or (wanted.isdigit() and s.value == int(wanted))]
+    if wanted.isdigit() and (numbered := [s for s in structures if s.value == int(wanted)]):
+        return tuple(numbered[:1])
+    exact = [s for s in structures if _plain(s.name) == wanted]
     if exact:
         return tuple(_distinct(segmentation, exact)[:1])
     meant = next((group for group in _ALIASES if _without_number(wanted) in group), frozenset({wanted}))
@@ -191,13 +193,15 @@ def find(segmentation: Segmentation, name: str) -> tuple[Structure, ...]:
     )
 
 
-def _numbered(structures: tuple[Structure, ...], name: str) -> Structure | None:
+def _numbered(segmentation: Segmentation, name: str) -> Structure | None:
     """The K-th of several of one name, which is asked for as `name (K)`; None for other words."""
     asked = re.fullmatch(r"(.+?)\s*\((\d+)\)", name.strip())
-    if asked is None:
+    named = {} if segmentation.volume is None else segmentation.volume.names
+    alike = [place for place, other in sorted(named.items()) if asked and _plain(other) == _plain(asked.group(1))]
+    if asked is None or not 0 < int(asked.group(2)) <= len(alike):
         return None
-    alike = [s for s in structures if _plain(s.name) == _plain(asked.group(1))]
-    return alike[int(asked.group(2)) - 1] if 0 < int(asked.group(2)) <= len(alike) else None
+    place = alike[int(asked.group(2)) - 1]
+    return next((s for s in segmentation.structures if (s.layer, s.value) == place), None)
 
 
 def _distinct(segmentation: Segmentation, found: list[Structure]) -> list[Structure]:
@@ -206,21 +210,25 @@ def _distinct(segmentation: Segmentation, found: list[Structure]) -> list[Struct
     Raises:
         FileError: two of them have one name.
     """
-    names = [_plain(structure.name) for structure in found]
-    alike = [structure for structure in found if names.count(_plain(structure.name)) > 1]
-    if not alike:
+    named = {} if segmentation.volume is None else segmentation.volume.names
+    sought = {_plain(structure.name) for structure in found}
+    alike = [(name, place) for place, name in sorted(named.items()) if _plain(name) in sought]
+    twice = [(name, place) for name, place in alike if [_plain(other) for other, _ in alike].count(_plain(name)) > 1]
+    if not twice:
         return found
     words = [
-        f"{s.name} ({k}): label {s.value} of layer {s.layer}, {_size(segmentation, s)}" for k, s in enumerate(alike, 1)
+        f"{name} ({number}): label {value} of layer {layer}, {_size(segmentation, layer, value)}"
+        for number, (name, (layer, value)) in enumerate(twice, 1)
     ]
     raise FileError(
-        f"{segmentation.path}: expected one segment called {alike[0].name!r}, it has {len(alike)}: {'; '.join(words)}. "
-        f'Say which: "{alike[0].name} (2)", or rename one.'
+        f"{segmentation.path}: expected one segment called {twice[0][0]!r}, it has {len(twice)}: {'; '.join(words)}. "
+        f'Say which: "{twice[0][0]} (1)", or rename one.'
     )
 
 
-def _size(segmentation: Segmentation, structure: Structure) -> str:
-    return f"{1e6 * voxels_of(segmentation, [structure]).volume:.3g} ml"
+def _size(segmentation: Segmentation, layer: int, value: int) -> str:
+    there = next((s for s in segmentation.structures if (s.layer, s.value) == (layer, value)), None)
+    return "no voxels" if there is None else f"{1e6 * voxels_of(segmentation, [there]).volume:.3g} ml"
 
 
 def the_organ(segmentation: Segmentation) -> str:
