@@ -13,6 +13,7 @@ from ..data.outcome import Equilibrium
 from ..fem.fenicsx import assemble_matrix, create_matrix, form, ufl
 from ..fem.forms import DiscreteLoad
 from .linear import LinearSolver
+from .path import LoadPath
 from .system import System
 from .tangent import factored
 
@@ -62,7 +63,7 @@ class Starts:
 
     def candidates(
         self,
-        load: DiscreteLoad,
+        path: LoadPath,
         guess: ArrayLike | Equilibrium | None,
         proposal: ArrayLike | Proposal | None,
         fallback: bool,
@@ -70,19 +71,22 @@ class Starts:
         """Starts for a load, the most promising first.
 
         Args:
-            load: the load.
+            path: of the load that is wanted.
             guess: state whose neighbour is wanted: it comes first while its tangent can be trusted.
             proposal: displacement that is thought to be near an equilibrium of this load, whichever, or a function that
                 says it: it competes with the warped linear response, and the one of less energy comes first.
             fallback: also rest, and what comes after a guess that is near.
         """
+        load, seen = path.whole, path.seen(1.0)
         near, is_trusted = (None, False) if guess is None else self._near(guess, load)
         if near is not None and is_trusted:
             yield Start(near, "guess", may_leave=False, has_tangent=isinstance(guess, Equilibrium))
             if not fallback:
                 return
-        linear = self._linear_response(load)
-        first, merit = self._first_guess(linear, load)
+        linear = self._linear_response(seen)
+        first, merit = self._first_guess(linear, seen)
+        if seen is not load:  # merits differ by the work on the way of the frame
+            linear, first, merit = path.carried(linear, 1.0), path.carried(first, 1.0), None
         starts = [Start(first, "linear response")]
         if near is not None and not is_trusted:
             starts.append(Start(near, "guess"))
@@ -94,8 +98,8 @@ class Starts:
             merits += [self._merit(start.unknowns, load) for start in starts[1:]]
             starts = [starts[place] for place in np.argsort(merits, kind="stable")]
         yield from starts
-        if fallback and not self._has_lift(load):
-            yield Start(np.zeros_like(load.dead), "rest")
+        if fallback and not self._has_lift(seen):
+            yield Start(path.carried(np.zeros_like(load.dead), 1.0), "rest")
 
     def _lifted(self, state: ArrayLike | Equilibrium, load: DiscreteLoad, name: str) -> Floats:
         """A state with its held unknowns where the load wants them."""
@@ -142,7 +146,7 @@ class Starts:
         if self._system.material.is_linear:
             return linear, None
         if self._space.mixed:
-            return self.extended(load), None
+            return self.extended(load.lift), None
         if self._has_lift(load):
             return self._warped(linear, load), None
         return self._lowest(linear, load)
@@ -173,11 +177,10 @@ class Starts:
         right[self._space.fixed] = 0.0
         return load.lift + self._at_rest().solve(right[None])[0]
 
-    def extended(self, load: DiscreteLoad) -> Floats:
+    def extended(self, lift: Floats) -> Floats:
         """Prescribed displacements carried into the body by linear elasticity, no other load."""
-        if not self._has_lift(load):
-            return np.zeros_like(load.dead)
-        return self._linear_response(replace(DiscreteLoad.none(self._space), lift=load.lift))
+        load = replace(DiscreteLoad.none(self._space), lift=lift)
+        return self._linear_response(load) if self._has_lift(load) else np.zeros_like(lift)
 
     def _at_rest(self) -> LinearSolver:
         if self._rest is None:
