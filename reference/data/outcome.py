@@ -52,7 +52,8 @@ class Equilibrium:
         trace: every iteration, where asked for.
         local_iterations: Newton iterations of a few cells alone (nonlinear elimination).
         load: what is in balance; its following pressures belong to the tangent.
-        start: where Newton's method came from: `guess`, `proposal`, `linear response`, `rest` or `load steps`.
+        start: where Newton's method came from: `guess`, `proposal`, `linear response`, `rotation` (prescribed ones
+            carried into the body), `rest` or `load steps`.
     """
 
     displacement: Floats

@@ -45,11 +45,11 @@ def in_load_steps(newton: Newton, starts: Starts, path: LoadPath, first_step: fl
         first_step: part of it that is tried first.
     """
     reached, step, good, spent = 0.0, first_step, 0, 0
+    screws = starts.screws(path)
     state, last = np.zeros_like(path.whole.dead), None
     for _ in range(newton.options.max_load_steps):
         target = min(1.0, reached + step)
-        change = path.seen(target).lift - path.seen(reached).lift
-        start = path.carried(path.from_frame(state, reached) + starts.extended(change), target)
+        start = starts.ahead(path, screws, state, reached, target)
         tried = newton.run(path.load(target), start, target, eliminate=True)
         spent += tried.iterations
         if not tried.converged:

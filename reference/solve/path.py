@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from ..data.loading import Loading
 from ..fem.forms import DiscreteLoad
-from .rigid import RigidMotion, fitted
+from .rigid import RigidMotion, fitted, screwed
 from .system import System
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+_FAR_TURN = 0.5  # radians: more, and a displacement that grows straight is far from what turns
 _ROUNDING = 1e-12  # of the largest coordinate: nodes that are no farther from where a motion takes them go with it
 
 
@@ -129,6 +130,18 @@ class LoadPath:
         lift[self._space.fixed] = self._space.unknowns("Loading.displacement", field)[self._space.fixed]
         return lift
 
+    @property
+    def screws(self) -> tuple[Floats, Floats] | None:
+        """Angles and velocities of the screws of held nodes as unknowns; None where nothing turns far in the frame."""
+        screws = [(part.nodes, *part.motion.screw) for part in self._parts]
+        if not any(np.linalg.norm(angle) > _FAR_TURN for _, angle, _ in screws):
+            return None
+        dimension = self._points.shape[1]
+        angles, velocities = np.zeros_like(self._points), np.zeros_like(self._points)
+        for nodes, angle, velocity in screws:
+            angles[nodes], velocities[nodes] = angle[-dimension:], velocity[:dimension]
+        return self._lift(angles), self._lift(velocities)
+
     # ------------------------------------------------------------------ states
 
     def carried(self, unknowns: Floats, factor: float) -> Floats:
@@ -141,6 +154,19 @@ class LoadPath:
     def from_frame(self, unknowns: Floats, factor: float) -> Floats:
         """A state in space as the frame sees it at a part of the load."""
         return unknowns if self._frame.is_none else self._turned(unknowns, self._frame.part(factor).back)
+
+    def screwed(self, unknowns: Floats, angles: Floats, velocities: Floats) -> Floats:
+        """A state whose nodes go on by a screw each, as `screws` gives them."""
+        space, dimension = self._space, self._points.shape[1]
+        turns, moves = np.zeros((2, len(space.nodes), 3))
+        turns[:, -dimension:] = angles[space.own_numbers].reshape(-1, dimension)
+        moves[:, :dimension] = velocities[space.own_numbers].reshape(-1, dimension)
+
+        def motion(points: Floats) -> Floats:
+            in_space = np.pad(points, ((0, 0), (0, 3 - dimension)))
+            return screwed(in_space, turns, moves)[:, :dimension]
+
+        return self._turned(unknowns, motion)
 
     def _turned(self, unknowns: Floats, motion: Callable[[Floats], Floats]) -> Floats:
         out, points, own = unknowns.copy(), self._points[self._space.nodes], self._space.own_numbers

@@ -46,23 +46,35 @@ class RigidMotion:
         """Where moved points, (n, d), metres, come from."""
         return (points - self.translation) @ self.rotation
 
-    def part(self, factor: float) -> RigidMotion:
-        """So much of the motion: a screw about one axis of space, of at most half a turn (the geodesic of SE(3)).
+    @property
+    def screw(self) -> tuple[Floats, Floats]:
+        """Angle about the axis, (3,), radians, and velocity of the origin, (3,), metres, over the whole motion.
 
-        It stays the same motion whatever the origin is. Half a turn goes the way on which the first coordinate of the
-        axis that is not zero is positive.
+        The screw turns by at most half a turn, about one axis of space whatever the origin is (the geodesic of SE(3)).
+        Half a turn goes the way on which the first coordinate of the axis that is not zero is positive.
+        """
+        dimension = len(self.translation)
+        rotation, translation = np.eye(3), np.zeros(3)
+        rotation[:dimension, :dimension], translation[:dimension] = self.rotation, self.translation
+        angle = _rotation_vector(rotation)
+        return angle, np.linalg.solve(_mean_rotation(angle), translation)
+
+    def part(self, factor: float) -> RigidMotion:
+        """So much of the motion, along its screw.
 
         Args:
             factor: 0 for rest, 1 for the whole.
         """
         dimension = len(self.translation)
-        rotation, translation = np.eye(3), np.zeros(3)
-        rotation[:dimension, :dimension], translation[:dimension] = self.rotation, self.translation
-        angles = _rotation_vector(rotation)
-        velocity = np.linalg.solve(_mean_rotation(angles), translation)
-        turned = Rotation.from_rotvec(factor * angles).as_matrix()
-        moved = factor * _mean_rotation(factor * angles) @ velocity
-        return RigidMotion(turned[:dimension, :dimension], moved[:dimension])
+        angle, velocity = (factor * part for part in self.screw)
+        rotation = Rotation.from_rotvec(angle).as_matrix()[:dimension, :dimension]
+        return RigidMotion(rotation, (_mean_rotation(angle) @ velocity)[:dimension])
+
+
+def screwed(points: Floats, angles: Floats, velocities: Floats) -> Floats:
+    """Points, (n, 3), metres, each moved by a screw of its own, as `RigidMotion.screw` gives it, (n, 3) both."""
+    moved = Rotation.from_rotvec(angles).apply(points)
+    return np.asarray(moved + np.einsum("nij,nj->ni", _mean_rotation(angles), velocities))
 
 
 def fitted(points: Floats, moved: Floats) -> tuple[RigidMotion, bool]:
@@ -104,9 +116,10 @@ def _rotation_vector(rotation: Floats) -> Floats:
 
 
 def _mean_rotation(vector: Floats) -> Floats:
-    """Mean of the rotations by s times a vector for s in [0, 1], (3, 3): takes velocity to translation of a screw."""
-    angle = float(np.linalg.norm(vector))
-    cross = np.cross(np.eye(3), vector)
-    second = (angle - np.sin(angle)) / angle**3 if angle > _SMALL_ANGLE else 1.0 / 6.0
+    """Mean of the rotations by s times a vector, (..., 3), over s in [0, 1]: takes velocity to translation."""
+    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    cross = np.cross(np.eye(3), vector[..., None, :])
+    safe = np.maximum(angle, _SMALL_ANGLE)
+    second = np.where(angle < _SMALL_ANGLE, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
     first = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     return np.asarray(np.eye(3) + first * cross + second * cross @ cross)

@@ -30,7 +30,7 @@ class Start:
 
     Args:
         unknowns: this rank's.
-        name: where it comes from: `guess`, `proposal`, `linear response` (warped) or `rest`.
+        name: where it comes from: `guess`, `proposal`, `linear response` (warped), `rotation` or `rest`.
         may_leave: whether another equilibrium than the nearest may be found from here: then a few cells may be balanced
             alone on the way.
         has_tangent: whether the tangent that is factored is that of a state nearby.
@@ -88,6 +88,9 @@ class Starts:
         if seen is not load:  # merits differ by the work on the way of the frame
             linear, first, merit = path.carried(linear, 1.0), path.carried(first, 1.0), None
         starts = [Start(first, "linear response")]
+        screws = self.screws(path)
+        if screws is not None:
+            starts.append(Start(self.ahead(path, screws, np.zeros_like(load.dead), 0.0, 1.0), "rotation"))
         if near is not None and not is_trusted:
             starts.append(Start(near, "guess"))
         proposed = proposal(self._space.field(linear)) if callable(proposal) else proposal
@@ -181,6 +184,37 @@ class Starts:
         """Prescribed displacements carried into the body by linear elasticity, no other load."""
         load = replace(DiscreteLoad.none(self._space), lift=lift)
         return self._linear_response(load) if self._has_lift(load) else np.zeros_like(lift)
+
+    def screws(self, path: LoadPath) -> tuple[Floats, Floats] | None:
+        """Screws of held nodes over a path, angles and velocities, carried into the body; None where none turns far."""
+        screws = path.screws
+        return None if screws is None else (self._harmonic(screws[0]), self._harmonic(screws[1]))
+
+    def _harmonic(self, lift: Floats) -> Floats:
+        load = replace(DiscreteLoad.none(self._space), lift=lift)
+        return self.extended(lift) if self._space.mixed else self._warped(np.zeros_like(lift), load)
+
+    def ahead(
+        self, path: LoadPath, screws: tuple[Floats, Floats] | None, state: Floats, reached: float, target: float
+    ) -> Floats:
+        """A state at a part of a load moved by the change of the prescribed displacements to another part.
+
+        The body goes by the screws, and by linear elasticity for what these leave.
+
+        Args:
+            path: parts of the load.
+            screws: as `screws` gives them.
+            state: unknowns.
+            reached: the part of the load that it is at.
+            target: the part wanted.
+        """
+        seen = path.from_frame(state, reached)
+        missing = path.seen(target).lift - path.seen(reached).lift
+        if screws is not None:
+            angles, velocities = screws
+            seen = path.screwed(seen, (target - reached) * angles, (target - reached) * velocities)
+            missing[self._space.fixed] = (path.seen(target).lift - seen)[self._space.fixed]
+        return path.carried(seen + self.extended(missing), target)
 
     def _at_rest(self) -> LinearSolver:
         if self._rest is None:
