@@ -81,7 +81,7 @@ class NotConverged(RuntimeError):  # noqa: N818 - the way a search ended, named 
 
     Args:
         message: what happened.
-        load_factor: part of the load at which the last equilibrium was found; 0 if there was none.
+        load_factor: part of the load at which the last equilibrium was found (see `LoadPath`); 0 if there was none.
         last: that equilibrium; None if there was none.
         trace: every iteration.
     """

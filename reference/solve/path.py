@@ -39,9 +39,9 @@ class LoadPath:
 
     The displacements of each node set that is held in all axes are split into the rigid motion nearest to them, of
     whose screw the set goes that part, and a rest that grows with the factor. They are seen from a frame, which goes
-    that part of its own screw: so sets that move alike stay as they lie to each other all the way. The frame rests
-    where a set does; else it moves with the first set that tells a rotation, or with all held nodes where none does.
-    A set too small to tell one turns no more in the frame than it has to. What is held in some axes only tells no
+    that part of its own screw: so sets that move alike stay as they lie to each other all the way. The frame moves
+    with a set that tells a rotation: one at rest if there is one, else the first; or with all held nodes where none
+    does. A set too small to tell one turns no more in the frame than it has to. What is held in some axes only tells no
     rotation: it goes straight, and the frame rests. A linear law knows no rotations: all goes straight.
 
     Args:
@@ -58,7 +58,8 @@ class LoadPath:
             self._field[self._sets[name]] = values
         self._moved = self._points + self._field
         self._noise = _ROUNDING * max(float(np.abs(self._points).max()), float(np.abs(self._moved).max()))
-        self._frame, groups = self._frame_of([] if system.material.is_linear else self._groups(system))
+        is_straight = system.material.is_linear or not self._field.any()
+        self._frame, groups = self._frame_of([] if is_straight else self._groups(system))
         self._parts = [self._part(nodes) for nodes in groups]
 
     def _groups(self, system: System) -> list[Ints]:
@@ -73,14 +74,15 @@ class LoadPath:
 
     def _frame_of(self, groups: list[Ints]) -> tuple[RigidMotion, list[Ints]]:
         """The motion of the frame on the whole path, and the groups that are seen from it."""
-        held = self._space.held
-        rests = (held.any(axis=1) & ~held.all(axis=1)).any() or any(not self._field[nodes].any() for nodes in groups)
-        if rests or not groups:
-            return RigidMotion.none(self._points.shape[1]), groups
-        for nodes in groups:
-            motion, is_told = fitted(self._points[nodes], self._moved[nodes])
-            if is_told:
-                return motion, groups
+        held, none = self._space.held, RigidMotion.none(self._points.shape[1])
+        if not groups or (held.any(axis=1) & ~held.all(axis=1)).any():
+            return none, groups
+        fits = [(nodes, *fitted(self._points[nodes], self._moved[nodes])) for nodes in groups]
+        told = [(nodes, motion) for nodes, motion, is_told in fits if is_told]
+        if any(not self._field[nodes].any() for nodes, _ in told):
+            return none, groups
+        if told:
+            return told[0][1], groups
         together = np.concatenate(groups)
         return fitted(self._points[together], self._moved[together])[0], [together]
 

@@ -144,6 +144,7 @@ class Problem:
 
         Tries the full load from the guess, then from the warped linear response (before the guess where an equilibrium
         is too far), then from rest, then in load steps that are halved where they fail and grow where they succeed.
+        What prescribed displacements turn goes by its screw (`LoadPath`), by half a turn at most.
 
         Args:
             load: the load, or nodal forces alone, (n, 3), newtons.

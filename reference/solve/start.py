@@ -192,7 +192,7 @@ class Starts:
 
     def _harmonic(self, lift: Floats) -> Floats:
         load = replace(DiscreteLoad.none(self._space), lift=lift)
-        return self.extended(lift) if self._space.mixed else self._warped(np.zeros_like(lift), load)
+        return self._warped(np.zeros_like(lift), load)
 
     def ahead(
         self, path: LoadPath, screws: tuple[Floats, Floats] | None, state: Floats, reached: float, target: float
@@ -239,11 +239,12 @@ class Starts:
         return load.lift + self._poisson.solve(right[None])[0]
 
     def _prepare_warping(self) -> LinearSolver:
-        space = self._space
-        trial, test = ufl.TrialFunction(space.space), ufl.TestFunction(space.space)
-        dx = self._forms.dx
-        laplacian = form(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx)
-        missing = _warped_gradient(space.gradient(space.state)) - space.gradient(self._forms.direction)
+        space, dx, split = self._space, self._forms.dx, self._forms.split
+        (trial, p), (test, q) = split(ufl.TrialFunction(space.space)), split(ufl.TestFunction(space.space))
+        energy = ufl.inner(ufl.grad(trial), ufl.grad(test))
+        laplacian = form((energy + p * q if space.mixed else energy) * dx)  # pressures are kept out of it
+        state, direction = split(space.state)[0], split(self._forms.direction)[0]
+        missing = _warped_gradient(space.gradient(state)) - space.gradient(direction)
         self._warped_form = form(ufl.inner(missing, space.gradient(test)) * dx)
         matrix = create_matrix(laplacian)
         assemble_matrix(matrix, laplacian, space.conditions)
