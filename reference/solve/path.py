@@ -15,7 +15,8 @@ from .system import System
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-_FAR_TURN = 0.5  # radians: more, and a displacement that grows straight is far from what turns
+_FAR_TURN = 0.2  # radians from rest: more, and a displacement that grows straight is far from what turns
+_TURN = 0.02  # radians from a state that has turned already
 _ROUNDING = 1e-12  # of the largest coordinate: nodes that are no farther from where a motion takes them go with it
 
 
@@ -48,17 +49,22 @@ class LoadPath:
         system: body, law and what is held.
         given: the whole load, as `System.load` returns it.
         whole: the same as unknowns.
+        since: displacement that held nodes have at the factor 0, (n, d), metres; none if not given.
     """
 
-    def __init__(self, system: System, given: Loading, whole: DiscreteLoad) -> None:
-        self._space, self._given, self.whole = system.space, given, whole
+    def __init__(self, system: System, given: Loading, whole: DiscreteLoad, since: Floats | None = None) -> None:
+        self._system, self._space, self._given, self.whole = system, system.space, given, whole
         self._points, self._sets = system.body.points, system.body.node_sets
-        self._field = np.zeros_like(self._points)
+        self._first, last = np.zeros_like(self._points), np.zeros_like(self._points)
+        if since is not None:
+            self._first[self._space.held] = since[self._space.held]
         for name, values in given.displacement.items():
-            self._field[self._sets[name]] = values
-        self._moved = self._points + self._field
-        self._noise = _ROUNDING * max(float(np.abs(self._points).max()), float(np.abs(self._moved).max()))
-        is_straight = system.material.is_linear or not self._field.any()
+            last[self._sets[name]] = values
+        self._change = last - self._first
+        self._start, self._end = self._points + self._first, self._points + last
+        self._far = _FAR_TURN if since is None else _TURN
+        self._noise = _ROUNDING * max(float(np.abs(self._start).max()), float(np.abs(self._end).max()))
+        is_straight = system.material.is_linear or not self._change.any()
         self._frame, groups = self._frame_of([] if is_straight else self._groups(system))
         self._parts = [self._part(nodes) for nodes in groups]
 
@@ -77,22 +83,31 @@ class LoadPath:
         held, none = self._space.held, RigidMotion.none(self._points.shape[1])
         if not groups or (held.any(axis=1) & ~held.all(axis=1)).any():
             return none, groups
-        fits = [(nodes, *fitted(self._points[nodes], self._moved[nodes])) for nodes in groups]
+        fits = [(nodes, *fitted(self._start[nodes], self._end[nodes])) for nodes in groups]
         told = [(nodes, motion) for nodes, motion, is_told in fits if is_told]
-        if any(not self._field[nodes].any() for nodes, _ in told):
+        if any(not self._change[nodes].any() for nodes, _ in told):
             return none, groups
         if told:
             return told[0][1], groups
         together = np.concatenate(groups)
-        return fitted(self._points[together], self._moved[together])[0], [together]
+        return fitted(self._start[together], self._end[together])[0], [together]
 
     def _part(self, nodes: Ints) -> _Part:
-        points, seen = self._points[nodes], self._frame.back(self._moved[nodes])
+        points, seen = self._start[nodes], self._frame.back(self._end[nodes])
         motion = RigidMotion.none(points.shape[1])
         if np.abs(seen - points).max() > self._noise:
             motion, _ = fitted(points, seen)
         rest = motion.back(seen) - points
         return _Part(nodes, motion, rest if np.abs(rest).max() > self._noise else np.zeros_like(rest))
+
+    def since(self, displacement: Floats) -> LoadPath:
+        """The way to the same load for a body that has a displacement, (n, d), metres, already."""
+        return LoadPath(self._system, self._given, self.whole, displacement)
+
+    @property
+    def turns(self) -> bool:
+        """Whether the frame, or anything seen from it, turns far."""
+        return self.screws is not None or bool(np.linalg.norm(self._frame.screw[0]) > self._far)
 
     # ------------------------------------------------------------------ parts of the load
 
@@ -121,10 +136,10 @@ class LoadPath:
 
     def _displacement(self, factor: float, frame: RigidMotion) -> Floats:
         """Prescribed displacements of a part of the load, zero at free nodes, (n, d), metres."""
-        field = factor * self._field
+        field = self._first + factor * self._change
         for part in self._parts:
-            points = self._points[part.nodes]
-            field[part.nodes] = frame.of(part.motion.part(factor).of(points + factor * part.rest)) - points
+            now = part.motion.part(factor).of(self._start[part.nodes] + factor * part.rest)
+            field[part.nodes] = frame.of(now) - self._points[part.nodes]
         return field
 
     def _lift(self, field: Floats) -> Floats:
@@ -136,7 +151,7 @@ class LoadPath:
     def screws(self) -> tuple[Floats, Floats] | None:
         """Angles and velocities of the screws of held nodes as unknowns; None where nothing turns far in the frame."""
         screws = [(part.nodes, *part.motion.screw) for part in self._parts]
-        if not any(np.linalg.norm(angle) > _FAR_TURN for _, angle, _ in screws):
+        if not any(np.linalg.norm(angle) > self._far for _, angle, _ in screws):
             return None
         dimension = self._points.shape[1]
         angles, velocities = np.zeros_like(self._points), np.zeros_like(self._points)

@@ -149,7 +149,8 @@ class Problem:
         Args:
             load: the load, or nodal forces alone, (n, 3), newtons.
             guess: displacement whose neighbour is wanted, (n, 3), metres, or another equilibrium, which is first moved
-                along its tangent by the change of the load; the warped linear response if not given.
+                along its tangent by the change of the load, or turned where held nodes turn from there: so a twist goes
+                on beyond half a turn; the warped linear response if not given.
             proposal: displacement that is thought to be near this load's equilibrium, a network's answer for instance,
                 (n, 3), metres, or a function that says it (or None) from the linear response, (n, 3). It stands beside
                 the warped response: the one of less energy is tried first. Where the proposal leads to a state that is

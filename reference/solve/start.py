@@ -78,9 +78,9 @@ class Starts:
             fallback: also rest, and what comes after a guess that is near.
         """
         load, seen = path.whole, path.seen(1.0)
-        near, is_trusted = (None, False) if guess is None else self._near(guess, load)
+        near, is_trusted = (None, False) if guess is None else self._near(guess, path)
         if near is not None and is_trusted:
-            yield Start(near, "guess", may_leave=False, has_tangent=isinstance(guess, Equilibrium))
+            yield near
             if not fallback:
                 return
         linear = self._linear_response(seen)
@@ -92,7 +92,7 @@ class Starts:
         if screws is not None:
             starts.append(Start(self.ahead(path, screws, np.zeros_like(load.dead), 0.0, 1.0), "rotation"))
         if near is not None and not is_trusted:
-            starts.append(Start(near, "guess"))
+            starts.append(near)
         proposed = proposal(self._space.field(linear)) if callable(proposal) else proposal
         if proposed is not None:
             starts.append(Start(self._lifted(proposed, load, "proposal"), "proposal"))
@@ -110,23 +110,35 @@ class Starts:
         start[self._space.fixed] = load.lift[self._space.fixed]
         return start
 
-    def _near(self, guess: ArrayLike | Equilibrium, load: DiscreteLoad) -> tuple[Floats, bool]:
+    def _near(self, guess: ArrayLike | Equilibrium, path: LoadPath) -> tuple[Start, bool]:
         """The guess, an equilibrium moved along its tangent by the change of the load, and whether that can be trusted.
 
         A large change leads astray: from there Newton's method needs up to ten times the factorisations that it needs
-        from the warped response.
+        from the warped response. Where held nodes turn far from the guess, it turns with them.
         """
+        load = path.whole
         start = self._lifted(guess, load, "guess")
         if not isinstance(guess, Equilibrium):
-            return start, True
+            turned = self._turned(guess, path)
+            return Start(start if turned is None else turned, "guess", may_leave=False), True
         gap = self._forms.residual(start, load)
         gap[self._space.fixed] = 0.0
         step = -self._system.tangent.solve(*self._system.point(guess), gap[None])[0]
         at, ahead = self._merit(start, load), self._merit(start + step, load)
         promised = at if self._space.mixed else -0.5 * self._space.dot(gap, step)
         if 0.0 <= _TRUSTED * promised <= at - ahead:
-            return start + step, True
-        return (start + step, False) if ahead < at else (start, False)
+            return Start(start + step, "guess", may_leave=False, has_tangent=True), True
+        turned = self._turned(guess, path)
+        if turned is not None:
+            return Start(turned, "guess", may_leave=False), True
+        return Start(start + step if ahead < at else start, "guess"), False
+
+    def _turned(self, guess: ArrayLike | Equilibrium, path: LoadPath) -> Floats | None:
+        """The guess turned as held nodes turn from there; None where they do not, or where that folds a cell."""
+        state = self._system.unknowns(guess, "guess")
+        way = path.since(self._space.field(state))
+        turned = self.ahead(way, self.screws(way), state, 0.0, 1.0) if way.turns else None
+        return None if turned is None or self._merit(turned, path.whole) == np.inf else turned
 
     def _merit(self, unknowns: Floats, load: DiscreteLoad) -> float:
         """How far from balance a state is, less is closer: its energy under the load; infinite inside out.

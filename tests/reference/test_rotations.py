@@ -154,6 +154,31 @@ def test_what_is_stretched_and_turned_has_the_energy_of_the_stretch(block: Probl
     assert inside[1] == pytest.approx(inside[0], rel=SOLVED, abs=0.0)
 
 
+@pytest.mark.parametrize("step", [10.0, 60.0])
+def test_from_a_guess_a_twist_goes_on_beyond_half_a_turn(hexahedra: Problem, step: float) -> None:
+    """A whole turn has the displacements of none, and four times the energy of half a turn (within a tenth on five cells)."""
+    body = hexahedra.body
+    state = hexahedra.solve(twist(body, 180.0))
+    half = state.energy
+    for degrees in np.arange(180.0 + step, 361.0, step):
+        state = hexahedra.solve(twist(body, degrees), state)
+        assert state.start == "guess"
+    assert state.energy == pytest.approx(4.0 * half, rel=0.1)
+    np.testing.assert_allclose(state.displacement[body.node_sets["tip"]], 0.0, atol=ROUND_OFF)
+
+
+def test_a_guess_turns_with_the_body(hexahedra: Problem) -> None:
+    """A twisted beam turned by 150 degrees: the neighbour is the twisted beam turned, without an iteration but one."""
+    body = hexahedra.body
+    first = hexahedra.solve(twist(body, 100.0))
+    matrix, centre = rotation(SLANTED, 150), (1.0, -0.5, 0.3)
+    wanted = (body.points + first.displacement - centre) @ matrix.T + centre - body.points
+    for guess in (first, first.displacement):
+        state = hexahedra.solve(Loading(displacement=at_sets(body, wanted)), guess)
+        assert state.start == "guess" and state.iterations <= 2
+        np.testing.assert_allclose(state.displacement, wanted, atol=SOLVED * body.size)
+
+
 def test_load_steps_turn_with_the_load(hexahedra: Problem) -> None:
     """By parts of the load: the same states; and a rigid motion costs one check of balance a step."""
     body = hexahedra.body
