@@ -6,7 +6,11 @@ of 1e-10 of the reactions leaves in displacements and energies after conditionin
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,8 +28,8 @@ from softtwin.reference.data.materials import (
     LinearElastic,
     Material,
     NeoHookean,
-    SaintVenantKirchhoff,
 )
+from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.solve.newton import NewtonOptions
 from softtwin.reference.solve.path import LoadPath
 from softtwin.reference.solve.problem import Problem
@@ -41,7 +45,6 @@ SLANTED = (1.0, 2.0, -1.0)
 LAWS: dict[str, tuple[Body, Material]] = {
     "tetra, Neo-Hookean": (beam((5, 2, 2), SIZE, "tetrahedron"), NeoHookean(E, NU)),
     "hexahedron, Neo-Hookean": (beam((5, 2, 2), SIZE, "hexahedron"), NeoHookean(E, NU)),
-    "tetra, Saint-Venant-Kirchhoff": (beam((10, 3, 3), SIZE, "tetrahedron"), SaintVenantKirchhoff(E, NU)),
     "hexahedron, nearly incompressible": (beam((5, 2, 2), SIZE, "hexahedron"), IsochoricNeoHookean(E, 0.499)),
     "tetra10, incompressible": (beam((3, 1, 1), SIZE, "tetrahedron").quadratic(), IncompressibleNeoHookean(E / 3)),
 }
@@ -191,6 +194,61 @@ def test_load_steps_turn_with_the_load(hexahedra: Problem) -> None:
             np.testing.assert_allclose(state.displacement, wanted.displacement, atol=SOLVED * body.size, err_msg=name)
             if name == "whole":
                 assert state.iterations <= 3 * state.load_steps
+
+
+def test_where_a_turn_ends_early_the_last_state_is_that_of_a_part_of_it(hexahedra: Problem) -> None:
+    body, tip = hexahedra.body, hexahedra.body.node_sets["tip"]
+    options = NewtonOptions(first_step=0.25, max_load_steps=2)
+    with Problem(body, hexahedra.material, options, held=BOTH) as problem, pytest.raises(NotConverged) as raised:
+        problem.solve(twist(body, 160))
+    error = raised.value
+    assert error.last is not None and error.load_factor == 0.625
+    wanted = twist(body, 0.625 * 160).displacement["tip"]
+    np.testing.assert_allclose(error.last.displacement[tip], wanted, atol=ROUND_OFF)
+    np.testing.assert_allclose(error.last.load.displacement["tip"], wanted, atol=ROUND_OFF)
+
+
+PARALLEL = """
+import sys
+import numpy as np
+from mpi4py import MPI
+from scipy.spatial.transform import Rotation
+from softtwin.meshes.shapes import beam
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.solve.problem import Loading, NewtonOptions, Problem
+
+body, found = beam((5, 2, 2), (0.6, 0.2, 0.2), "tetrahedron"), {}
+whole = body.points @ Rotation.from_rotvec([1.5, 1.0, -1.0]).as_matrix().T + 0.1 - body.points
+twist = (body.points - 0.1) @ Rotation.from_rotvec([2.5, 0.0, 0.0]).as_matrix().T + 0.1 - body.points
+loads = {
+    "whole": {name: whole[body.node_sets[name]] for name in ("fixed", "tip")},
+    "twist": {"tip": twist[body.node_sets["tip"]]},
+}
+held = {"fixed": "xyz", "tip": "xyz"}
+for first in (1.0, 0.5):
+    options = NewtonOptions(tolerance=1e-10, first_step=first)
+    with Problem(body, NeoHookean(5e3, 0.4), options, held=held, comm=MPI.COMM_WORLD) as problem:
+        for name, moved in loads.items():
+            found[f"{name} {first}"] = problem.solve(Loading(displacement=moved)).displacement
+if MPI.COMM_WORLD.rank == 0:
+    np.savez(sys.argv[1], wanted=whole, ranks=MPI.COMM_WORLD.size, **found)
+"""
+
+
+@pytest.mark.mpi
+@pytest.mark.skipif(shutil.which("mpirun") is None, reason="mpirun is absent")
+def test_ranks_that_share_a_mesh_turn_alike(tmp_path: Path, mpi_environment: dict[str, str]) -> None:
+    script = ["mpirun", "-n", "2", sys.executable, "-c", PARALLEL, tmp_path / "found.npz"]
+    subprocess.run(script, env=mpi_environment, check=True, timeout=300)
+    found = dict(np.load(tmp_path / "found.npz"))
+    assert found["ranks"] == 2
+    body, material = LAWS["tetra, Neo-Hookean"]
+    field = turned(body.points, Rotation.from_rotvec([2.5, 0.0, 0.0]).as_matrix(), (0.1, 0.1, 0.1))
+    with Problem(body, material, NewtonOptions(tolerance=1e-10), held=BOTH) as problem:
+        twisted = problem.solve(Loading(displacement=at_sets(body, field, {"tip": "xyz"}))).displacement
+    for first in ("1.0", "0.5"):
+        np.testing.assert_allclose(found[f"whole {first}"], found["wanted"], atol=1e-9 * body.size)
+        np.testing.assert_allclose(found[f"twist {first}"], twisted, atol=SOLVED * body.size)
 
 
 def test_a_block_in_the_plane_turns_by_any_angle() -> None:
