@@ -159,7 +159,7 @@ def test_what_is_stretched_and_turned_has_the_energy_of_the_stretch(block: Probl
 
 @pytest.mark.parametrize("step", [10.0, 60.0])
 def test_from_a_guess_a_twist_goes_on_beyond_half_a_turn(hexahedra: Problem, step: float) -> None:
-    """A whole turn has the displacements of none, and four times the energy of half a turn (within a tenth on five cells)."""
+    """A whole turn has the displacements of none, and four times the energy of half a turn (five cells: to a tenth)."""
     body = hexahedra.body
     state = hexahedra.solve(twist(body, 180.0))
     half = state.energy
