@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Loading:
-    """A load; all parts add up and grow together in load steps.
+    """A load; all parts add up and grow together in load steps: prescribed rotations by angles, all else in proportion.
 
     Args:
         forces: nodal forces, (n, 3), newtons.
@@ -46,7 +46,7 @@ class Loading:
         return tuple(sorted({*self.traction, *self.pressure}))
 
     def scaled(self, factor: float) -> Loading:
-        """The same load, `factor` times as strong."""
+        """The same load, `factor` times as strong, displacements too: no part of a rotation (`LoadPath` has those)."""
 
         def times(value: Any) -> Any:
             return factor * np.asarray(value, dtype=np.float64)

@@ -52,7 +52,8 @@ class Equilibrium:
         trace: every iteration, where asked for.
         local_iterations: Newton iterations of a few cells alone (nonlinear elimination).
         load: what is in balance; its following pressures belong to the tangent.
-        start: where Newton's method came from: `guess`, `proposal`, `linear response`, `rest` or `load steps`.
+        start: where Newton's method came from: `guess`, `proposal`, `linear response`, `rotation` (prescribed ones
+            carried into the body), `rest` or `load steps`.
     """
 
     displacement: Floats
@@ -80,7 +81,7 @@ class NotConverged(RuntimeError):  # noqa: N818 - the way a search ended, named 
 
     Args:
         message: what happened.
-        load_factor: part of the load at which the last equilibrium was found; 0 if there was none.
+        load_factor: part of the load at which the last equilibrium was found (see `LoadPath`); 0 if there was none.
         last: that equilibrium; None if there was none.
         trace: every iteration.
     """

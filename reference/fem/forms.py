@@ -57,7 +57,7 @@ class DiscreteLoad:
         return DiscreteLoad(np.zeros(space.owned), np.zeros(space.owned), {})
 
     def scaled(self, factor: float) -> DiscreteLoad:
-        """The same load, `factor` times as strong."""
+        """The same load, `factor` times as strong, displacements too: no part of a rotation."""
         return DiscreteLoad(
             factor * self.dead, factor * self.lift, {name: factor * p for name, p in self.pressure.items()}
         )

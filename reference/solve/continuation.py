@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..fem.forms import DiscreteLoad
 from .newton import Attempt, Newton
+from .path import LoadPath
 from .start import Starts
 
 _GROWTH, _CUT = 1.5, 0.5  # of load steps after a success and a failure
@@ -35,21 +35,22 @@ class Continued:
     is_limit: bool
 
 
-def in_load_steps(newton: Newton, starts: Starts, load: DiscreteLoad, first_step: float) -> Continued:
+def in_load_steps(newton: Newton, starts: Starts, path: LoadPath, first_step: float) -> Continued:
     """Take a load from nothing to its whole, or as far as it goes.
 
     Args:
         newton: iterations.
         starts: carries prescribed displacements into the body.
-        load: the whole load.
+        path: parts of the load.
         first_step: part of it that is tried first.
     """
     reached, step, good, spent = 0.0, first_step, 0, 0
-    state, last = np.zeros_like(load.dead), None
+    screws = starts.screws(path)
+    state, last = np.zeros_like(path.whole.dead), None
     for _ in range(newton.options.max_load_steps):
         target = min(1.0, reached + step)
-        start = state + starts.extended(load.scaled(target - reached))
-        tried = newton.run(load.scaled(target), start, target, eliminate=True)
+        start = starts.ahead(path, screws, state, reached, target)
+        tried = newton.run(path.load(target), start, target, eliminate=True)
         spent += tried.iterations
         if not tried.converged:
             step *= _CUT

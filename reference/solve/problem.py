@@ -20,6 +20,7 @@ from ..fem.fenicsx import MPI, assemble_matrix, create_matrix, form, ufl
 from ..fem.forms import DiscreteLoad
 from .continuation import in_load_steps
 from .newton import Attempt, Newton, NewtonOptions
+from .path import LoadPath
 from .start import Proposal, Starts
 from .system import System
 
@@ -143,11 +144,13 @@ class Problem:
 
         Tries the full load from the guess, then from the warped linear response (before the guess where an equilibrium
         is too far), then from rest, then in load steps that are halved where they fail and grow where they succeed.
+        What prescribed displacements turn goes by its screw (`LoadPath`), by half a turn at most.
 
         Args:
             load: the load, or nodal forces alone, (n, 3), newtons.
             guess: displacement whose neighbour is wanted, (n, 3), metres, or another equilibrium, which is first moved
-                along its tangent by the change of the load; the warped linear response if not given.
+                along its tangent by the change of the load, or turned where held nodes turn from there: so a twist goes
+                on beyond half a turn; the warped linear response if not given.
             proposal: displacement that is thought to be near this load's equilibrium, a network's answer for instance,
                 (n, 3), metres, or a function that says it (or None) from the linear response, (n, 3). It stands beside
                 the warped response: the one of less energy is tried first. Where the proposal leads to a state that is
@@ -162,10 +165,11 @@ class Problem:
             NotConverged: no way led to an equilibrium; it holds the last one that was found on the way.
         """
         given, wanted = self.system.load(load)
+        path = LoadPath(self.system, given, wanted)
         self._newton.start_count()
         spent = 0
         if self.options.first_step == 1.0 or guess is not None or proposal is not None:
-            for start in self._starts.candidates(wanted, guess, proposal, fallback):
+            for start in self._starts.candidates(path, guess, proposal, fallback):
                 attempt = self._newton.run(wanted, start.unknowns, eliminate=start.may_leave, near=start.has_tangent)
                 spent += attempt.iterations
                 if attempt.converged and (start.name != "proposal" or self._is_lowest(attempt, wanted, stability)):
@@ -177,7 +181,7 @@ class Problem:
                     "Try a smaller change of the load, or fallback=True.",
                     trace=tuple(self._newton.trace),
                 )
-        return self._solve_in_steps(given, wanted, spent, stability, trace)
+        return self._solve_in_steps(path, spent, stability, trace)
 
     def _is_lowest(self, attempt: Attempt, load: DiscreteLoad, by_its_own: bool) -> bool:
         """Whether the energy is least where a stranger's proposal led; True where nobody knows.
@@ -195,19 +199,17 @@ class Problem:
             return True
         return not tangent.negative_pivots(attempt.unknowns, load)
 
-    def _solve_in_steps(
-        self, given: Loading, load: DiscreteLoad, spent: int, stability: bool, trace: bool
-    ) -> Equilibrium:
+    def _solve_in_steps(self, path: LoadPath, spent: int, stability: bool, trace: bool) -> Equilibrium:
         first = min(_FIRST_STEP, self.options.first_step) if spent else self.options.first_step
-        found = in_load_steps(self._newton, self._starts, load, first)
+        found = in_load_steps(self._newton, self._starts, path, first)
         spent += found.iterations
         if found.last is not None and found.reached == 1.0:
             whole = replace(found.last, iterations=spent)
-            return self._result(whole, given, load, found.load_steps, "load steps", stability, trace)
+            return self._result(whole, path.loading(1.0), path.whole, found.load_steps, "load steps", stability, trace)
         lines = tuple(self._newton.trace)
         last = None
         if found.last is not None:
-            part = given.scaled(found.reached), load.scaled(found.reached)
+            part = path.loading(found.reached), path.load(found.reached)
             last = self._result(found.last, *part, found.load_steps, "load steps", True, False)
         advice = (
             "No more load can be added there: a limit point, or a mesh too coarse for it. Try a smaller load, a finer "

@@ -13,6 +13,7 @@ from ..data.outcome import Equilibrium
 from ..fem.fenicsx import assemble_matrix, create_matrix, form, ufl
 from ..fem.forms import DiscreteLoad
 from .linear import LinearSolver
+from .path import LoadPath
 from .system import System
 from .tangent import factored
 
@@ -29,7 +30,7 @@ class Start:
 
     Args:
         unknowns: this rank's.
-        name: where it comes from: `guess`, `proposal`, `linear response` (warped) or `rest`.
+        name: where it comes from: `guess`, `proposal`, `linear response` (warped), `rotation` or `rest`.
         may_leave: whether another equilibrium than the nearest may be found from here: then a few cells may be balanced
             alone on the way.
         has_tangent: whether the tangent that is factored is that of a state nearby.
@@ -62,7 +63,7 @@ class Starts:
 
     def candidates(
         self,
-        load: DiscreteLoad,
+        path: LoadPath,
         guess: ArrayLike | Equilibrium | None,
         proposal: ArrayLike | Proposal | None,
         fallback: bool,
@@ -70,22 +71,28 @@ class Starts:
         """Starts for a load, the most promising first.
 
         Args:
-            load: the load.
+            path: of the load that is wanted.
             guess: state whose neighbour is wanted: it comes first while its tangent can be trusted.
             proposal: displacement that is thought to be near an equilibrium of this load, whichever, or a function that
                 says it: it competes with the warped linear response, and the one of less energy comes first.
             fallback: also rest, and what comes after a guess that is near.
         """
-        near, is_trusted = (None, False) if guess is None else self._near(guess, load)
+        load, seen = path.whole, path.seen(1.0)
+        near, is_trusted = (None, False) if guess is None else self._near(guess, path)
         if near is not None and is_trusted:
-            yield Start(near, "guess", may_leave=False, has_tangent=isinstance(guess, Equilibrium))
+            yield near
             if not fallback:
                 return
-        linear = self._linear_response(load)
-        first, merit = self._first_guess(linear, load)
+        linear = self._linear_response(seen)
+        first, merit = self._first_guess(linear, seen)
+        if seen is not load:  # merits differ by the work on the way of the frame
+            linear, first, merit = path.carried(linear, 1.0), path.carried(first, 1.0), None
         starts = [Start(first, "linear response")]
+        screws = self.screws(path)
+        if screws is not None:
+            starts.append(Start(self.ahead(path, screws, np.zeros_like(load.dead), 0.0, 1.0), "rotation"))
         if near is not None and not is_trusted:
-            starts.append(Start(near, "guess"))
+            starts.append(near)
         proposed = proposal(self._space.field(linear)) if callable(proposal) else proposal
         if proposed is not None:
             starts.append(Start(self._lifted(proposed, load, "proposal"), "proposal"))
@@ -94,8 +101,8 @@ class Starts:
             merits += [self._merit(start.unknowns, load) for start in starts[1:]]
             starts = [starts[place] for place in np.argsort(merits, kind="stable")]
         yield from starts
-        if fallback and not self._has_lift(load):
-            yield Start(np.zeros_like(load.dead), "rest")
+        if fallback and not self._has_lift(seen):
+            yield Start(path.carried(np.zeros_like(load.dead), 1.0), "rest")
 
     def _lifted(self, state: ArrayLike | Equilibrium, load: DiscreteLoad, name: str) -> Floats:
         """A state with its held unknowns where the load wants them."""
@@ -103,23 +110,35 @@ class Starts:
         start[self._space.fixed] = load.lift[self._space.fixed]
         return start
 
-    def _near(self, guess: ArrayLike | Equilibrium, load: DiscreteLoad) -> tuple[Floats, bool]:
+    def _near(self, guess: ArrayLike | Equilibrium, path: LoadPath) -> tuple[Start, bool]:
         """The guess, an equilibrium moved along its tangent by the change of the load, and whether that can be trusted.
 
         A large change leads astray: from there Newton's method needs up to ten times the factorisations that it needs
-        from the warped response.
+        from the warped response. Where held nodes turn far from the guess, it turns with them.
         """
+        load = path.whole
         start = self._lifted(guess, load, "guess")
         if not isinstance(guess, Equilibrium):
-            return start, True
+            turned = self._turned(guess, path)
+            return Start(start if turned is None else turned, "guess", may_leave=False), True
         gap = self._forms.residual(start, load)
         gap[self._space.fixed] = 0.0
         step = -self._system.tangent.solve(*self._system.point(guess), gap[None])[0]
         at, ahead = self._merit(start, load), self._merit(start + step, load)
         promised = at if self._space.mixed else -0.5 * self._space.dot(gap, step)
         if 0.0 <= _TRUSTED * promised <= at - ahead:
-            return start + step, True
-        return (start + step, False) if ahead < at else (start, False)
+            return Start(start + step, "guess", may_leave=False, has_tangent=True), True
+        turned = self._turned(guess, path)
+        if turned is not None:
+            return Start(turned, "guess", may_leave=False), True
+        return Start(start + step if ahead < at else start, "guess"), False
+
+    def _turned(self, guess: ArrayLike | Equilibrium, path: LoadPath) -> Floats | None:
+        """The guess turned as held nodes turn from there; None where they do not, or where that folds a cell."""
+        state = self._system.unknowns(guess, "guess")
+        way = path.since(self._space.field(state))
+        turned = self.ahead(way, self.screws(way), state, 0.0, 1.0) if way.turns else None
+        return None if turned is None or self._merit(turned, path.whole) == np.inf else turned
 
     def _merit(self, unknowns: Floats, load: DiscreteLoad) -> float:
         """How far from balance a state is, less is closer: its energy under the load; infinite inside out.
@@ -142,7 +161,7 @@ class Starts:
         if self._system.material.is_linear:
             return linear, None
         if self._space.mixed:
-            return self.extended(load), None
+            return self.extended(load.lift), None
         if self._has_lift(load):
             return self._warped(linear, load), None
         return self._lowest(linear, load)
@@ -173,11 +192,41 @@ class Starts:
         right[self._space.fixed] = 0.0
         return load.lift + self._at_rest().solve(right[None])[0]
 
-    def extended(self, load: DiscreteLoad) -> Floats:
+    def extended(self, lift: Floats) -> Floats:
         """Prescribed displacements carried into the body by linear elasticity, no other load."""
-        if not self._has_lift(load):
-            return np.zeros_like(load.dead)
-        return self._linear_response(replace(DiscreteLoad.none(self._space), lift=load.lift))
+        load = replace(DiscreteLoad.none(self._space), lift=lift)
+        return self._linear_response(load) if self._has_lift(load) else np.zeros_like(lift)
+
+    def screws(self, path: LoadPath) -> tuple[Floats, Floats] | None:
+        """Screws of held nodes over a path, angles and velocities, carried into the body; None where none turns far."""
+        screws = path.screws
+        return None if screws is None else (self._harmonic(screws[0]), self._harmonic(screws[1]))
+
+    def _harmonic(self, lift: Floats) -> Floats:
+        load = replace(DiscreteLoad.none(self._space), lift=lift)
+        return self._warped(np.zeros_like(lift), load)
+
+    def ahead(
+        self, path: LoadPath, screws: tuple[Floats, Floats] | None, state: Floats, reached: float, target: float
+    ) -> Floats:
+        """A state at a part of a load moved by the change of the prescribed displacements to another part.
+
+        The body goes by the screws, and by linear elasticity for what these leave.
+
+        Args:
+            path: parts of the load.
+            screws: as `screws` gives them.
+            state: unknowns.
+            reached: the part of the load that it is at.
+            target: the part wanted.
+        """
+        seen = path.from_frame(state, reached)
+        missing = path.seen(target).lift - path.seen(reached).lift
+        if screws is not None:
+            angles, velocities = screws
+            seen = path.screwed(seen, (target - reached) * angles, (target - reached) * velocities)
+            missing[self._space.fixed] = (path.seen(target).lift - seen)[self._space.fixed]
+        return path.carried(seen + self.extended(missing), target)
 
     def _at_rest(self) -> LinearSolver:
         if self._rest is None:
@@ -202,11 +251,12 @@ class Starts:
         return load.lift + self._poisson.solve(right[None])[0]
 
     def _prepare_warping(self) -> LinearSolver:
-        space = self._space
-        trial, test = ufl.TrialFunction(space.space), ufl.TestFunction(space.space)
-        dx = self._forms.dx
-        laplacian = form(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx)
-        missing = _warped_gradient(space.gradient(space.state)) - space.gradient(self._forms.direction)
+        space, dx, split = self._space, self._forms.dx, self._forms.split
+        (trial, p), (test, q) = split(ufl.TrialFunction(space.space)), split(ufl.TestFunction(space.space))
+        energy = ufl.inner(ufl.grad(trial), ufl.grad(test))
+        laplacian = form((energy + p * q if space.mixed else energy) * dx)  # pressures are kept out of it
+        state, direction = split(space.state)[0], split(self._forms.direction)[0]
+        missing = _warped_gradient(space.gradient(state)) - space.gradient(direction)
         self._warped_form = form(ufl.inner(missing, space.gradient(test)) * dx)
         matrix = create_matrix(laplacian)
         assemble_matrix(matrix, laplacian, space.conditions)
