@@ -89,14 +89,20 @@ def summary(found: Read) -> dict[str, Any]:
     return {"points": len(held["points"])} if "points" in held else {"numbers": 16}
 
 
-def is_less(now: dict[str, Any], before: dict[str, Any]) -> bool:
-    """Whether a file holds less than it did.
+def is_less(now: dict[str, Any], before: dict[str, Any], way: str) -> bool:
+    """Whether a file holds less than it did: fewer cells, points or voxels.
+
+    Where bytes were changed, other numbers in as many cells are another file that is whole in itself: a coordinate or
+    the label of a voxel. Only its cells and points are counted then, and the volume where bytes were lost.
 
     Args:
         now: summary of the damaged file.
         before: of the whole one.
+        way: in which it was damaged.
     """
-    return any(now.get(name, 0) < value * (1 - LESS if name == "volume" else 1) for name, value in before.items())
+    kept = {"cells", "points", "numbers"} | (set() if way in ("change", "number") else {"voxels"})
+    kept |= {"volume"} if way in ("cut", "lose") else set()
+    return any(now.get(name, 0) < before[name] * (1 - LESS if name == "volume" else 1) for name in kept & set(before))
 
 
 def child(listing: Path) -> None:
@@ -175,7 +181,7 @@ def work(name: str, given: Given) -> dict[str, Any]:
                 told.append((writer, way))
                 wholes.append(whole)
         for (writer, way), whole, found in zip(told, wholes, outcomes(listed, root), strict=True):
-            kind = _kind(writer, whole, found)
+            kind = _kind(writer, whole, found, way)
             counts[kind] += 1
             if kind in ("traceback", "crash", "silent"):
                 examples.setdefault(kind, f"{writer.name}, {way}: {json.dumps(found)[:300]}")
@@ -183,14 +189,14 @@ def work(name: str, given: Given) -> dict[str, Any]:
     return {"files": len(listed), **{kind: counts[kind] for kind in kinds}, "examples": examples}
 
 
-def _kind(writer: Writer, whole: dict[str, Any], found: dict[str, Any]) -> str:
+def _kind(writer: Writer, whole: dict[str, Any], found: dict[str, Any], way: str) -> str:
     if "crash" in found:
         return "crash"
     if "error" in found:
         return "traceback"
     if found["refused"]:
         return "refused"
-    if not is_less(found["holds"], whole):
+    if not is_less(found["holds"], whole, way):
         return "read"
     if found["said"]:
         return "said"

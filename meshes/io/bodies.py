@@ -83,7 +83,7 @@ def read_body(path: str | Path) -> Body:
     if _MARK not in arrays:
         raise FileError(f"{path}: not a body written by softtwin; read it as a mesh and say which nodes are fixed.")
     sets, surfaces, points, triangles = (_named(arrays, prefix) for prefix in _PREFIXES)
-    blocks = grid_blocks(grid)
+    blocks = grid_blocks(path, grid)
     inner = {name: Surface(points[name], triangles[name]) for name in points}
     kind = next(kind for kind in KINDS.values() if kind.name in blocks)
     positions = vtk_to_numpy(grid.GetPoints().GetData())[:, : kind.dimension]

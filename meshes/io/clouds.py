@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from ..body import Floats
 from .common import TURN, Axes, ContentError, FileError, Unit, existing, placed
+from .formats.apart import read_apart
 from .formats.ply import read_ply_normals
 from .formats.table import Table, read_table
-from .formats.vtk import READERS, read_vtk
-from .raw import read_anyhow
+from .formats.vtk import READERS
+from .raw import FARTHEST, read_anyhow
 
 _log = logging.getLogger(__name__)
 TABLES = (".txt", ".csv", ".xyz", ".pts", ".asc", ".tsv", ".xyzn", ".xyzrgb")
@@ -89,6 +89,8 @@ def read_points(path: str | Path, unit: Unit = "m", axes: Axes = "lps", normals:
     if len(points) == 0:
         raise ContentError(f"{path}: expected a cloud with points, got none.")
     keep = np.isfinite(points).all(axis=1)
+    if (far := float(np.abs(points[keep]).max(initial=0.0))) > FARTHEST:
+        raise ContentError(f"{path}: expected coordinates of an organ, got {far:.3g}; the file may be damaged.")
     if lost := int((~keep).sum()):
         said.append(f"points: {lost} of {len(points)} rows have no measurement (NaN or infinity) and were left out")
     zeros = (points == 0.0).all(axis=1)
@@ -135,7 +137,8 @@ def _of_table(path: Path, table: Table, normals: bool) -> tuple[Floats, Floats |
             places = [1, 2, 3]
             said.append("columns: the first counts the rows and was left out")
     if normals and facing is None:
-        columns = [[at, at + 1, at + 2] for at in (places[-1] + 1, places[-1] + 4)]
+        width = table.values.shape[1]
+        columns = [[at, at + 1, at + 2] for at in (places[-1] + 1, places[-1] + 4) if at + 3 <= width]
         facing = next((three for three in columns if _are_normals(table.values[:, three])), None)
     if more := table.values.shape[1] - len(places) - len(facing or ()):
         said.append(f"columns: {more} beside the coordinates were left out")
@@ -191,11 +194,7 @@ def _vertex_normals(path: Path) -> Floats | None:
     if suffix == ".ply":
         found = read_ply_normals(path)
     elif suffix in READERS:
-        data = read_vtk(path).GetPointData()
-        names = [data.GetArrayName(i) for i in range(data.GetNumberOfArrays())]
-        named = [name for name in names if name and name.lower() == "normals"]
-        array = data.GetNormals() or (data.GetArray(named[0]) if named else None)
-        found = None if array is None else vtk_to_numpy(array)
+        found = read_apart(path).normals
     return None if found is None else np.asarray(found, dtype=np.float64)
 
 

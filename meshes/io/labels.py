@@ -8,6 +8,7 @@ knows neither TotalSegmentator's names nor the second place that a NIfTI header 
 
 from __future__ import annotations
 
+import gzip
 import re
 import warnings
 import zlib
@@ -150,9 +151,22 @@ def _read_nifti(path: Path, axes: Axes | None) -> LabelMap:
         raise FileError(f"{path}: expected one volume of voxels with three axes, got shape {shape}.")
     scale, unit = _nifti_unit(path, image.header)
     labels = _gathered(path, shape[:3], _slabs(image.dataobj, shape))
+    _check_end(path, image)
     to_lps = _checked_place(path, np.diag([scale, scale, scale, 1.0]) @ _TURN @ image.affine)
     names, notes = _nifti_names(image.header), _nifti_notes(image, scale)
     return LabelMap(path, labels[None], to_lps, unit, "ras", names, notes, scale)
+
+
+def _check_end(path: Path, image: Any) -> None:
+    """Refuse a file whose checksum is wrong, or that is longer than its voxels: something in it moved."""
+    opened = gzip.open if path.suffix.lower() == ".gz" else open
+    size = 0
+    with opened(path, "rb") as file:
+        while part := file.read(_SLAB):
+            size += len(part)
+    wanted = image.dataobj.offset + int(np.prod(image.shape)) * image.get_data_dtype().itemsize
+    if size != wanted:
+        raise FileError(f"{path}: expected {wanted} bytes for its voxels, got {size}; the file may be damaged.")
 
 
 def _slabs(voxels: Any, shape: tuple[int, ...]) -> Iterator[NDArray[Any]]:

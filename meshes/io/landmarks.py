@@ -23,6 +23,7 @@ _COLUMNS: dict[tuple[str, str, str], Axes | None] = {
 }
 _LABELS = ("label", "name", "id")
 _FIDUCIALS = ("id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label")
+_STATES = ("defined", "undefined", "preview", "missing")  # of Slicer; only the first has a place
 _SYSTEMS: dict[str, Axes] = {"0": "ras", "1": "lps", "RAS": "ras", "LPS": "lps"}
 
 
@@ -124,6 +125,9 @@ def _markups(path: Path) -> tuple[_Named, Axes, float]:
             raise FileError(f"{path}: expected points in m, cm, mm or um, got {word!r}.")
         frames.add((_axes(path, str(markup.get("coordinateSystem", "LPS"))), unit[0]))
         points = markup.get("controlPoints", [])
+        states = {str(point.get("positionStatus", "defined")) for point in points}
+        if unknown := states - set(_STATES):
+            raise ValueError(f"positionStatus: expected {', '.join(_STATES)}, got {min(unknown)!r}")
         found += [(p["label"], p["position"]) for p in points if p.get("positionStatus", "defined") == "defined"]
     if len(frames) != 1:
         raise FileError(f"{path}: expected lists of points in one unit and on one kind of axes, got {len(frames)}.")

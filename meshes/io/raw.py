@@ -13,12 +13,13 @@ import numpy as np
 from ..body import Floats, Ints
 from ..cells import counted, dimension
 from .common import AXES, HEAD, UNITS, Axes, ContentError, FileError, Unit, existing
+from .formats.apart import read_apart
 from .formats.msh import is_first_msh, read_first_msh, read_msh
 from .formats.obj import read_obj
 from .formats.ply import read_ply
 from .formats.polygons import triangulated
 from .formats.stl import read_stl
-from .formats.vtk import READERS, from_vtk, read_vtk
+from .formats.vtk import READERS
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,8 @@ def read_raw(path: str | Path) -> RawMesh:
         raise ContentError(f"{path}: the file holds no points; it may be truncated or damaged.")
     if not np.isfinite(mesh.points).all():
         raise ContentError(f"{path}: expected finite coordinates, got NaN or infinity.")
+    if (far := float(np.abs(mesh.points).max())) > FARTHEST:
+        raise ContentError(f"{path}: expected coordinates of an organ, got {far:.3g}; the file may be damaged.")
     for name, block in mesh.cells.items():
         if block.min(initial=0) < 0 or block.max(initial=0) >= len(mesh.points):
             raise FileError(f"{path}: a {name} refers to a point that is not there; the file may be damaged.")
@@ -84,7 +87,8 @@ def read_anyhow(path: str | Path) -> RawMesh:
     path = existing(path)
     suffix = path.suffix.lower()
     if suffix in READERS:
-        return RawMesh(*from_vtk(path))
+        found = read_apart(path)
+        return RawMesh(found.points, found.cells)
     if suffix not in _OWN:
         known = ", ".join((*_OWN, *READERS))
         raise FileError(f"{path}: expected a mesh file ({known}), got suffix {suffix!r}.")
@@ -104,6 +108,7 @@ def _any_msh(path: Path) -> tuple[Floats, dict[str, Ints]]:
     return read_first_msh(path) if is_first_msh(path.read_bytes()[:HEAD]) else read_msh(path)
 
 
+FARTHEST = 1e12  # of any unit: beyond, squares of distances are no numbers of use
 _OWN: Mapping[str, Callable[[Path], tuple[Floats, Any]]] = {
     ".stl": read_stl, ".obj": read_obj, ".msh": _any_msh, ".ply": read_ply,
 }  # fmt: skip
@@ -117,8 +122,7 @@ def _stated(path: Path, name: str) -> str:
         return found.group(1).decode("latin-1") if found else ""
     if f'Name="{name}"'.encode() not in head:  # field data stand first, and the whole file need not be read
         return ""
-    array = read_vtk(path).GetFieldData().GetAbstractArray(name)
-    return str(array.GetValue(0)) if array and array.IsA("vtkStringArray") and array.GetNumberOfValues() else ""
+    return read_apart(path).words.get(name, "")
 
 
 def stated_axes(path: str | Path) -> Axes | None:

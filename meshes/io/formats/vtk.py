@@ -23,6 +23,7 @@ from .polygons import by_length, stripped, triangulated
 READERS: Mapping[str, Any] = {
     ".vtk": vtkDataSetReader, ".vtu": vtkXMLUnstructuredGridReader, ".vtp": vtkXMLPolyDataReader,
 }  # fmt: skip
+_ANY_SIZE = ("vertex group", "line string", "polyhedron")
 _NAMES = {kind.vtk: kind.name for kind in KINDS.values()} | {
     **{1: "vertex", 2: "vertex group", 3: "line", 4: "line string", 21: "line3"},
     **{6: "triangle strip", 7: "polygon", 8: "pixel", 23: "quad8"},
@@ -59,27 +60,28 @@ def read_vtk(path: Path) -> Any:
     with vtk_messages() as window:
         reader.Update()
         data = reader.GetOutput()
-        said = " ".join(window.GetOutput().split())
+        output = window.GetOutput()
+        said = " ".join((output.decode("latin-1") if isinstance(output, bytes) else output).split())
     if said or data is None or reader.GetErrorCode():
         raise FileError(f"{path}: could not be read as {path.suffix[1:]}; the file may be truncated or damaged "
                         f"({said[:200] or 'VTK gave no reason'}).")  # fmt: skip
     return data
 
 
-def from_vtk(path: Path) -> tuple[Floats, dict[str, Ints]]:
-    """Points (p, 3) and cells by kind.
+def content(path: Path, data: Any) -> tuple[Floats, dict[str, Ints]]:
+    """Points (p, 3) and cells by kind of a data set.
 
     Args:
-        path: the file.
+        path: its file, for messages.
+        data: the data set.
 
     Raises:
-        FileError: cut off, damaged, or another kind of data set.
+        FileError: damaged, or another kind of data set.
     """
-    data = read_vtk(path)
     if data.IsA("vtkPolyData"):
         return _points(data), _poly_blocks(path, data)
     if data.IsA("vtkUnstructuredGrid"):
-        return _points(data), grid_blocks(data)
+        return _points(data), grid_blocks(path, data)
     raise FileError(f"{path}: expected an unstructured grid or polygons, got {data.GetClassName()}.")
 
 
@@ -108,28 +110,40 @@ def _lists(path: Path, cells: Any, count: int) -> list[Ints]:
     return np.split(corners.astype(np.int64), offsets[1:-1])
 
 
-def grid_blocks(grid: Any) -> dict[str, Ints]:
-    """Cells of an unstructured grid by kind.
+def grid_blocks(path: Path, grid: Any) -> dict[str, Ints]:
+    """Cells of an unstructured grid by kind; polygons and strips become triangles.
 
     Args:
+        path: its file, for messages.
         grid: of VTK.
+
+    Raises:
+        FileError: cells without points, or of points that are not there.
     """
     if grid.GetNumberOfCells() == 0:
         return {}
-    array = grid.GetCells()
-    types = np.array([grid.GetCellType(i) for i in range(grid.GetNumberOfCells())])
-    connectivity = vtk_to_numpy(array.GetConnectivityArray()).astype(np.int64)
-    sizes = np.array([grid.GetCellSize(i) for i in range(len(types))])
-    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    blocks = {}
+    lists = _lists(path, grid.GetCells(), grid.GetNumberOfPoints())
+    types = np.array([grid.GetCellType(number) for number in range(len(lists))])
+    sizes = np.array([len(corners) for corners in lists])
+    blocks: dict[str, Ints] = {}
     for kind in np.unique(types):
-        of_kind = types == kind
-        name, nodes = _NAMES.get(int(kind), ""), int(sizes[of_kind].min())
+        chosen = np.flatnonzero(types == kind)
+        name, few, many = _NAMES.get(int(kind), ""), sizes[chosen].min(), sizes[chosen].max()
         if not name:
             cell = vtkGenericCell()
             cell.SetCellType(int(kind))
             name = other_cell(cell.GetCellDimension(), f"VTK type {kind}")
-        blocks[name] = connectivity[starts[of_kind][:, None] + np.arange(nodes)]
+        if few == 0 or (few != many and name not in ("polygon", "triangle strip", *_ANY_SIZE)):
+            raise FileError(f"{path}: a {name} has {few} points and another {many}; the file may be damaged.")
+        parts = [lists[number] for number in chosen]
+        if name == "polygon":
+            triangles = [triangulated(_points(grid), group) for group in by_length(parts)]
+        elif name == "triangle strip":
+            triangles = [stripped(parts)]
+        else:
+            blocks[name] = np.stack([part[:few] for part in parts])
+            continue
+        blocks["triangle"] = np.concatenate([blocks.get("triangle", np.empty((0, 3), np.int64)), *triangles])
     return blocks
 
 
