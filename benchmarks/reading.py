@@ -106,18 +106,26 @@ def difference(content: str, options: str, found: dict[str, Any]) -> str:
     if found["kind"] != content:
         return f"read as {found['kind']}"
     if content == "surface":
-        return _not(np.isclose(found["volume"], 1e-9 * abs(surface().volume), rtol=1e-5), "volume") or _not(
-            found["cells"] == len(surface().triangles), "triangles") or _same(found["points"], surface().points)  # fmt: skip
+        whole = [
+            _not(np.isclose(found["volume"], 1e-9 * abs(surface().volume), rtol=1e-5), "volume"),
+            _not(found["cells"] == len(surface().triangles), "triangles"),
+            _same(found["points"], surface().points),
+        ]
+        return next(filter(None, whole), "")
     if content == "volume":
         points, cells = volume(options.split(",")[0])
-        return _not(np.isclose(found["volume"], 1e-9 * 80 * 60 * 40, rtol=1e-6), "volume") or _not(
-            found["cells"] == len(cells), "cells") or _same(found["points"], points)  # fmt: skip
+        whole = [
+            _not(np.isclose(found["volume"], 1e-9 * 80 * 60 * 40, rtol=1e-6), "volume"),
+            _not(found["cells"] == len(cells), "cells"),
+            _same(found["points"], points),
+        ]
+        return next(filter(None, whole), "")
     if content == "cloud":
         return _same(found["points"], cloud())
     if content == "landmarks":
-        return _not(set(found["points"]) == set(LANDMARKS), "names") or _not(
-            all(np.allclose(found["points"][name], 1e-3 * np.array(place), atol=1e-7) for name, place in LANDMARKS.items()),
-            "places")  # fmt: skip
+        held = found["points"]
+        places = [np.allclose(held[name], 1e-3 * np.array(place), atol=1e-7) for name, place in LANDMARKS.items()]
+        return _not(set(held) == set(LANDMARKS), "names") or _not(all(places), "places")
     if content == "transform":
         wanted = pose()
         wanted[:3, 3] *= 1e-3

@@ -112,6 +112,11 @@ def pose() -> np.ndarray:
 
 # --- Surfaces.
 
+_XML = (
+    ("ascii", "", "little"), ("binary", "zlib", "big"), ("appended", "lz4", "little"), ("raw", "lzma", "little"),
+    ("raw", "", "big"),
+)  # fmt: skip
+
 
 def _polydata(points: np.ndarray, triangles: np.ndarray | None) -> Any:
     if triangles is None:
@@ -169,6 +174,10 @@ def _strips(path: Path) -> None:
     _vtk_xml(path, stripper.GetOutput(), vtk.vtkXMLPolyDataWriter(), "binary", "zlib", "little")
 
 
+def _softtwin(path: Path, place: Coordinates) -> None:
+    write_surface(path, Surface(place.lengths(1e-3 * surface().points), surface().triangles), place=place)
+
+
 def _as_obj(
     path: Path, corner: str, beside: str = "", behind: str = "", newline: str = "\n", comma: bool = False
 ) -> None:
@@ -210,8 +219,7 @@ def _surfaces() -> Iterator[Writer]:
         for binary in (True, False):
             yield writer("pyvista", suffix, "binary" if binary else "text",
                          lambda p, b=binary: _pyvista(p, binary=b))  # fmt: skip
-    for mode, compressor, order in (("ascii", "", "little"), ("binary", "zlib", "big"), ("appended", "lz4", "little"),
-                                    ("raw", "lzma", "little"), ("raw", "", "big")):  # fmt: skip
+    for mode, compressor, order in _XML:
         yield writer("VTK", ".vtp", ", ".join(filter(None, (mode, compressor, order))),
                      lambda p, m=mode, c=compressor, o=order: _vtk_xml(
                          p, _polydata(points, triangles), vtk.vtkXMLPolyDataWriter(), m, c, o))  # fmt: skip
@@ -236,8 +244,7 @@ def _surfaces() -> Iterator[Writer]:
     yield writer("gmsh", ".ply2", "", lambda p: _gmsh(p, points, triangles, 2, 2, 2.2, False))
     for suffix in (".stl", ".ply", ".obj", ".vtp"):
         for place in (Coordinates("mm", "ras"), Coordinates("cm", "lps"), Coordinates("m", "ras")):
-            yield writer("softtwin", suffix, f"{place.unit}, {place.axes}",
-                         lambda p, at=place: write_surface(p, Surface(at.lengths(1e-3 * points), triangles), place=at))  # fmt: skip
+            yield writer("softtwin", suffix, f"{place.unit}, {place.axes}", lambda p, at=place: _softtwin(p, at))
     yield writer(
         "by hand", ".obj", "as Blender", lambda p: _as_obj(p, "{0}/{0}/{0}", "vt 0 0\nvt 1 0\nvn 0 0 1\no a\ns off")
     )
@@ -263,8 +270,7 @@ def _volumes() -> Iterator[Writer]:
         def writer(program: str, suffix: str, options: str, write: Callable[[Path], Any], kind: str = kind) -> Writer:
             return Writer("volume", program, suffix, f"{kind}, {options}", write)
 
-        for mode, compressor, order in (("ascii", "", "little"), ("binary", "zlib", "big"), ("appended", "lz4", "little"),
-                                        ("raw", "lzma", "little"), ("raw", "", "big")):  # fmt: skip
+        for mode, compressor, order in _XML:
             yield writer("VTK", ".vtu", ", ".join(filter(None, (mode, compressor, order))),
                          lambda p, k=kind, m=mode, c=compressor, o=order: _vtk_xml(
                              p, _grid(k), vtk.vtkXMLUnstructuredGridWriter(), m, c, o))  # fmt: skip
@@ -272,8 +278,9 @@ def _volumes() -> Iterator[Writer]:
             yield writer("VTK", ".vtk", f"{version / 10}, {'binary' if binary else 'text'}",
                          lambda p, k=kind, v=version, b=binary: _legacy(p, _grid(k), b, v))  # fmt: skip
         for form, suffix, options in (
-            ("vtu", ".vtu", {"binary": True}), ("vtk42", ".vtk", {"binary": True}), ("vtk51", ".vtk", {"binary": False}),
-            ("gmsh22", ".msh", {"binary": True}), ("gmsh22", ".msh", {"binary": False}),
+            ("vtu", ".vtu", {"binary": True}), ("vtk42", ".vtk", {"binary": True}),
+            ("vtk51", ".vtk", {"binary": False}), ("gmsh22", ".msh", {"binary": True}),
+            ("gmsh22", ".msh", {"binary": False}),
             ("gmsh", ".msh", {"binary": True}), ("gmsh", ".msh", {"binary": False}), ("abaqus", ".inp", {}),
             ("nastran", ".bdf", {}), ("xdmf", ".xdmf", {}), ("med", ".med", {}),
         ):  # fmt: skip
@@ -281,10 +288,10 @@ def _volumes() -> Iterator[Writer]:
                 continue
             words = "" if "binary" not in options else "binary" if options["binary"] else "text"
             yield writer("meshio", suffix, ", ".join(filter(None, (form, words))),
-                         lambda p, x=points, c=cells, n=name, f=form, o=options: _meshio(p, x, [(n, c)], f, **o))  # fmt: skip
+                         lambda p, x=(points, [(name, cells)]), f=form, o=options: _meshio(p, *x, f, **o))  # fmt: skip
         for version, binary in ((1.0, False), (2.2, False), (2.2, True), (4.1, False), (4.1, True)):
             yield writer("gmsh", ".msh", f"{version}, {'binary' if binary else 'text'}",
-                         lambda p, x=points, c=cells, n=number, v=version, b=binary: _gmsh(p, x, c, n, 3, v, b))  # fmt: skip
+                         lambda p, x=(points, cells, number), v=version, b=binary: _gmsh(p, *x, 3, v, b))  # fmt: skip
         yield writer("gmsh", ".unv", "", lambda p, x=points, c=cells, n=number: _gmsh(p, x, c, n, 3, 2.2, False))
         yield writer("pyvista", ".vtu", "", lambda p, k=kind: pyvista.wrap(_grid(k)).save(p))
 
@@ -340,8 +347,10 @@ def _clouds() -> Iterator[Writer]:
         ("blanks, decimal commas", ".txt", {"separator": " ", "comma": True}),
         ("commas, decimal commas", ".csv", {"separator": ",", "comma": True}),
         ("as CloudCompare", ".txt", {"separator": " ", "head": "//X Y Z R G B\n300\n", "behind": "1 2 3"}),
-        ("as CloudCompare, scalar field", ".asc", {"separator": ",", "head": "//X,Y,Z,Scalar field\n", "behind": "0.5"}),
-        ("as ParaView", ".csv", {"separator": ",", "head": '"N:0","Points:0","Points:1","Points:2"\n', "before": "0.5,"}),
+        ("as CloudCompare, scalar field", ".asc",
+         {"separator": ",", "head": "//X,Y,Z,Scalar field\n", "behind": "0.5"}),
+        ("as ParaView", ".csv",
+         {"separator": ",", "head": '"N:0","Points:0","Points:1","Points:2"\n', "before": "0.5,"}),
         ("PTS with a count", ".pts", {"separator": " ", "head": "300\n", "behind": "10 1 2 3"}),
         ("pandas with an index", ".csv", {"separator": ",", "head": ",x,y,z\n", "before": "7,"}),
         ("units in the names", ".csv", {"separator": ",", "head": "x [mm],y [mm],z [mm],t [s]\n", "behind": "0"}),
@@ -415,14 +424,14 @@ def _meta(path: Path, compress: bool) -> None:
 
 
 def _sitk(path: Path, compress: bool, kind: str) -> None:
-    import SimpleITK as sitk
+    import SimpleITK
 
-    image = sitk.GetImageFromArray(labels().transpose(2, 1, 0))
+    image = SimpleITK.GetImageFromArray(labels().transpose(2, 1, 0))
     place = _place(ras=False)
     image.SetSpacing(VOXEL.tolist())
     image.SetOrigin(CORNER.tolist())
     image.SetDirection((place[:3, :3] / VOXEL).ravel().tolist())
-    sitk.WriteImage(sitk.Cast(image, getattr(sitk, kind)), str(path), compress)
+    SimpleITK.WriteImage(SimpleITK.Cast(image, getattr(SimpleITK, kind)), str(path), compress)
 
 
 def _labels() -> Iterator[Writer]:

@@ -107,13 +107,13 @@ def _nested(surface: Surface, cavities: Cavities) -> tuple[Surface, tuple[float,
     is_closed = np.ones(count, dtype=np.bool_)
     is_closed[vertices[_open_edges(surface.triangles)[:, 0]]] = False
     found = nesting(surface, pieces, is_closed)
-    if not found.is_cavity.any():
+    turned = found.is_known & (found.is_inward != found.is_cavity)
+    if not (turned.any() or found.is_cavity.any()):
         return surface, (), False
     volumes = tuple(np.sort(found.volumes[found.is_cavity])[::-1].tolist())
     misled = bool((found.is_cavity & ~found.is_inward).any())  # the outermost component winds outward by now
     if cavities == "fill":
         return compacted(Surface(surface.points, surface.triangles[(found.depths == 0)[pieces]])), volumes, misled
-    turned = found.is_known & (found.is_inward != found.is_cavity)
     flipped = np.where(turned[pieces][:, None], surface.triangles[:, ::-1], surface.triangles)
     return Surface(surface.points, flipped), volumes, misled
 

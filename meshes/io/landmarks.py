@@ -114,7 +114,7 @@ def _fiducials(path: Path) -> tuple[_Named, Axes]:
 
 def _markups(path: Path) -> tuple[_Named, Axes, float]:
     """All points of a file; several lists in it are taken together."""
-    lists = json.loads(path.read_text(encoding="utf-8-sig"))["markups"]
+    lists = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_once)["markups"]
     found: _Named = []
     frames = set()
     for markup in lists:
@@ -133,6 +133,14 @@ def _markups(path: Path) -> tuple[_Named, Axes, float]:
         raise FileError(f"{path}: expected lists of points in one unit and on one kind of axes, got {len(frames)}.")
     axes, scale = frames.pop()
     return found, axes, scale
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; a key that is there twice swallowed what stood between."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key twice in one object")
+    return found
 
 
 def _axes(path: Path, said: str) -> Axes:
