@@ -85,8 +85,8 @@ def page(figures: Figures) -> str:
         "",
         "Each program at hand wrote the same organ, cloud, label map, landmarks and pose in its options; softtwin read "
         "the files. *Same* means equal volume, points, cells, labels, place and unit. *Refused* means an error that "
-        f"says why, here in short. Of {len(rows)} files {counts[SAME]} are the same, {counts[REFUSED]} are refused, and "
-        f"{counts[OTHER]} differ.",
+        f"says why, here in short. Of {len(rows)} files {counts[SAME]} are the same, {counts[REFUSED]} are refused, "
+        f"and {counts[OTHER]} differ.",
         "",
         f"Programs: {programs}. Files *by hand* have the form that a program is known to write.",
         "",
