@@ -78,6 +78,7 @@ class Frame:
         seconds: wall time, that of a search for the pose included.
         cloud: points that were used, after thinning, (p, 3), metres; None as above.
         landmarks: how many pulled beside the cloud.
+        missing: rows of the cloud that were passed over: zeros, where a depth camera has measured nothing.
     """
 
     number: int
@@ -86,6 +87,7 @@ class Frame:
     seconds: float
     cloud: Floats | None = None
     landmarks: int = 0
+    missing: int = 0
 
 
 class Twin:
@@ -309,7 +311,7 @@ class Twin:
     def _posed_result(
         self, cloud: ArrayLike, zone: str | None, camera: Camera, run: Callable[[Engine, Floats], Registration]
     ) -> Registration:
-        points = np.asarray(cloud, dtype=np.float64)
+        points = Cloud.of(cloud).array()  # rows of zeros are none before they are turned
         if isinstance(camera, Pose):
             back = camera.inverse()
             return replace(run(self.registrar(zone), turned(points, back.rotation, back.translation)), pose=camera)
@@ -508,7 +510,8 @@ class Sequence:
         """
         begin = time.perf_counter()
         try:
-            points = self._thinned(cloud)
+            given = self._thinned(cloud)
+            points = given.array()
             if self.camera == "align":
                 self.camera = self.twin.aligned(points)
             result = self.twin.follow(points, self.zone, self._last, self.camera, until, landmarks)
@@ -517,12 +520,13 @@ class Sequence:
         if result.judgement.is_usable:
             self._last = result
         count = 0 if landmarks is None else len(np.asarray(landmarks[0]))
-        return Frame(self._next(), result.judgement, result, time.perf_counter() - begin, points[:, :3], count)
+        seconds = time.perf_counter() - begin
+        return Frame(self._next(), result.judgement, result, seconds, points[:, :3], count, given.missing)
 
-    def _thinned(self, cloud: ArrayLike) -> Floats:
+    def _thinned(self, cloud: ArrayLike) -> Cloud:
         """Once for all that is tried with it; what is no cloud is left for the registrar to refuse."""
         given = Cloud.of(cloud)
-        return (given.thinned(self.twin.config.registration.points) if given.is_finite else given).array()
+        return given.thinned(self.twin.config.registration.points) if given.is_finite else given
 
     def refuse(self, reason: str, seconds: float = 0.0) -> Frame:
         """The next frame without a result: its cloud cannot be used.
