@@ -56,6 +56,8 @@ Ints = NDArray[np.int64]
 
 Engine = Registrar | HybridRegistrar | ContactRegistrar
 MODEL_ERROR = "model_error.npz"  # in a twin: covariance of its model-error ensemble
+# Of a pose of which nothing is believed: radians, body sizes. With two thirds or twice as much margins change by 2 %.
+_OPEN_ROTATION, _OPEN_TRANSLATION = float(np.deg2rad(30.0)), 0.2
 FORMER_MODEL_ERROR = "doubt.npz"  # the name of that file before
 Camera = Pose | PosePrior | Literal["align"] | None
 """Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
@@ -374,7 +376,7 @@ class Twin:
         found = align(Surface(outer(self.body).rest.points, self._seen), Cloud.of(cloud).points)
         if not found.is_found:
             raise CloudError(f"cloud: the pose was not found ({found.outcome.value}). {found.outcome.advice}")
-        return self.near(found.pose)
+        return self.about(found.pose)
 
     @property
     def _seen(self) -> Ints:
@@ -385,6 +387,15 @@ class Twin:
         """An unknown pose about an expected one, with the deviations of the configuration."""
         options = self.config.registration
         return PosePrior(pose, self._middle, np.deg2rad(options.pose_rotation), options.pose_translation)
+
+    def about(self, pose: Pose) -> PosePrior:
+        """An unknown pose about one that was fitted to the moved organ itself: to its cloud, or to landmarks on it.
+
+        Such a pose follows the organ's own movement as far as it can. Believed beforehand to be near the true one, it
+        would count what the camera sees twice, and forces would be found too small. It is a place to begin; what is
+        believed of the pose is as good as nothing.
+        """
+        return PosePrior(pose, self._middle, _OPEN_ROTATION, _OPEN_TRANSLATION * self.body.size)
 
     @cached_property
     def as_said(self) -> PosePrior | None:

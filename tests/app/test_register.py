@@ -175,6 +175,12 @@ def test_a_start_is_an_unknown_unless_said_otherwise(plain_twin: Twin, wanted: s
     assert not isinstance(camera, PosePrior) or camera.rotation_deviation == pytest.approx(np.deg2rad(2.0))
 
 
+def test_of_a_start_that_was_fitted_to_the_moved_organ_nothing_is_believed(plain_twin: Twin) -> None:
+    near, about = (camera_of(plain_twin, Pose.identity(), is_fitted=fitted) for fitted in (False, True))
+    assert isinstance(near, PosePrior) and isinstance(about, PosePrior) and not about.is_said
+    assert (about.deviations > 5.0 * near.deviations).all()
+
+
 # --- What is written.
 
 
