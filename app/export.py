@@ -119,7 +119,8 @@ class Exporter:
             "deviation": place.distances(result.uncertainty.deviation),
         }
         moved = place.lengths(result.displacement)
-        write_deformed(self.folder / name, self._body, moved, fields, place.words)
+        words = {**place.words, "MARGINS_IN": result.frame}
+        write_deformed(self.folder / name, self._body, moved, fields, words)
         return name
 
     def _write_surfaces(self, number: int, result: Registration) -> list[str]:

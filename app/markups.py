@@ -40,7 +40,8 @@ class Target:
     Args:
         label: its name; no two are alike.
         position: (3,), metres, in the coordinates of the body at rest.
-        margin: distance within which it lies with 95 %, metres; of a centre, the largest on its structure.
+        margin: distance within which it lies with 95 % in these coordinates, metres; of a centre, the largest on its
+            structure.
         remark: of what, and what else there is to say.
     """
 
@@ -81,9 +82,18 @@ def _points_of(name: str, rest: Surface, carried: Embedding, result: Registratio
     verdict, doubts = result.judgement.verdict, result.judgement.reasons
     warning = "" if verdict is Verdict.ACCEPTED else f"; FRAME {verdict.value.upper()}: {'; '.join(doubts)}"
     alone = f"; {1e3 * own:.1f} mm for its centre alone" if math.isfinite(own) else ""
+    alone += _of_camera(result, carried)
     yield Target(name, weights @ moved, float(margins.max()), f"for each point of {name}{alone}{warning}")
     for number, vertex in enumerate(_spread(rest, count), 1):
         yield Target(f"{name} {number}", moved[vertex], float(margins[vertex]), f"for this point of {name}{warning}")
+
+
+def _of_camera(result: Registration, carried: Embedding) -> str:
+    """What is known of a structure where the camera sees it, in words; none where its coordinates are no others."""
+    if not result.has_free_pose:
+        return ""
+    margin = float(result.camera_uncertainty.margin(carried, _CONFIDENCE).max())
+    return f"; {1e3 * margin:.1f} mm in the camera's coordinates" if math.isfinite(margin) else ""
 
 
 def _shares(surface: Surface) -> Floats:

@@ -25,6 +25,7 @@ from pyigtl.messages import CRC64, MessageBase, PolyDataMessage, StringMessage, 
 from softtwin.meshes.body import Surface
 from softtwin.meshes.export import Coordinates
 from softtwin.registration.result import Registration
+from softtwin.registration.uncertainty import Uncertainty
 
 from .answer import Answer
 from .record import NOTICE, finite
@@ -227,7 +228,8 @@ class Speaker:
         figures = {"notice": NOTICE, **figures_of(self.twin, answer, self.place, row), "network": dict(counts)}
         text = json.dumps(finite(figures))  # ASCII, which is all that pyigtl packs without an error
         if len(text) > _LONGEST:
-            text = json.dumps(finite({**figures, "margin95_mm": {}, "reasons": figures["reasons"][:1]}))
+            few = {name: {} for name in figures if name.endswith("margin95_mm")} | {"reasons": figures["reasons"][:1]}
+            text = json.dumps(finite({**figures, **few}))
         return text
 
 
@@ -255,17 +257,27 @@ def figures_of(twin: Twin, answer: Answer, place: Coordinates, row: Mapping[str,
     }
     if found is None:
         return figures
-    margins = {twin.organ: float(found.uncertainty.margin().max())}
-    if row is None:
-        margins |= {name: float(found.uncertainty.margin(at).max()) for name, at in twin.embeddings.items()}
-    else:
-        margins |= {name: target["margin95_m"] for name, target in row["targets"].items()}
+    figures["margin95_mm"] = _margins(twin, found.uncertainty, row, "margin95_m")
+    if found.has_free_pose:
+        figures["camera_margin95_mm"] = _margins(twin, found.camera_uncertainty, row, "camera_margin95_m")
     return figures | {
         "net_force_N": place.directions(found.net_force).tolist(),
         "net_force_deviation_N": found.net_force_deviation.tolist(),
         "rms_distance_mm": 1e3 * found.rms_distance,
-        "margin95_mm": {name: 1e3 * margin for name, margin in margins.items()},
+        "points": found.points,
+        "points_left_out": found.left_out,
+        "margins_in": found.frame,
     }
+
+
+def _margins(twin: Twin, known: Uncertainty, row: Mapping[str, Any] | None, entry: str) -> dict[str, float]:
+    """The largest 95 % margin of each structure, millimetres; those of inner ones from the record's row, if given."""
+    every = {twin.organ: float(known.margin().max())}
+    if row is None:
+        every |= {name: float(known.margin(points).max()) for name, points in twin.embeddings.items()}
+    else:
+        every |= {name: target[entry] for name, target in row["targets"].items()}
+    return {name: 1e3 * margin for name, margin in every.items()}
 
 
 def _packed(message: MessageBase) -> bytes:

@@ -78,6 +78,8 @@ class Recorder:
     def figures(self, frame: Frame, cloud: str = "", **more: Any) -> dict[str, Any]:
         """What is known of a frame, without a file of it; arguments as for `add`."""
         row: dict[str, Any] = {"frame": frame.number, "cloud": cloud, "verdict": frame.judgement.verdict.value}
+        if frame.missing:
+            row["points_missing"] = frame.missing
         row |= {"reasons": list(frame.judgement.reasons), "seconds": frame.seconds, "files": [], **more}
         if frame.landmarks:
             row["landmarks"] = frame.landmarks
@@ -171,6 +173,7 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "largest_correction_m": float(np.linalg.norm(result.correction, axis=1).max()),
         "pose": twin.coordinates.motion(result.pose.matrix).tolist(),
         "points": result.points,
+        "points_left_out": result.left_out,
         "points_alike": result.inflation_factor,
         "outliers": result.outliers,
         "informed": result.informed,
@@ -211,11 +214,14 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         }
     moved = {name: points.displace(result.displacement) for name, points in twin.embeddings.items()}
     known = result.uncertainty
+    row["margins_in"] = result.frame
     row["deviation_m"] = {"mean": float(known.deviation.mean()), "largest": float(known.deviation.max())}
     row["targets"] = {
         name: {"movement_m": _mean_length(vectors), "margin95_m": float(known.margin(twin.embeddings[name]).max())}
         for name, vectors in moved.items()
     }
+    for name, target in row["targets"].items() if result.has_free_pose else ():
+        target["camera_margin95_m"] = float(result.camera_uncertainty.margin(twin.embeddings[name]).max())
     if truth is not None:
         rest = twin.body.points
         row["error"] = asdict(target_errors(rest + result.displacement, truth))
@@ -276,6 +282,8 @@ def describe(row: Mapping[str, Any]) -> str:
         return line
     force, deviation = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
     line += f", cloud to surface {millimetres(row['rms_distance_m'])}"
+    line += f" without {row['points_left_out']} of {row['points']} points" if row.get("points_left_out") else ""
+    line += f", {row['points_missing']} rows of zeros passed over" if "points_missing" in row else ""
     if "shared_noise" in row:
         size, length = (row["shared_noise"][name] for name in ("size_m", "length_m"))
         line += f", of which neighbours within {millimetres(length, 0)} share noise of {millimetres(size)}"
@@ -299,6 +307,8 @@ def describe(row: Mapping[str, Any]) -> str:
         line += f", error {millimetres(row['error']['mean'])}"
     for name, target in row["targets"].items():
         line += f", {name} moved {millimetres(target['movement_m'], 1)} ± {millimetres(target['margin95_m'], 1)}"
+        seen = target.get("camera_margin95_m")
+        line += "" if seen is None else f" (± {millimetres(seen, 1)} in the camera's coordinates)"
         line += f" ({millimetres(target['error_m'])} off)" if "error_m" in target else ""
     return line
 

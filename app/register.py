@@ -316,7 +316,8 @@ class Scene:
             say(describe_landmarks(fit))
             pose = fit.pose
         with self.home.twin(**self.options) as twin:
-            yield twin, "align" if start.align else camera_of(twin, pose)
+            is_fitted = start.landmarks is not None
+            yield twin, "align" if start.align else camera_of(twin, pose, is_fitted=is_fitted)
 
 
 def say_coordinates(twin: Twin, say: Callable[[str], None]) -> None:
@@ -326,16 +327,17 @@ def say_coordinates(twin: Twin, say: Callable[[str], None]) -> None:
         say(note)
 
 
-def camera_of(twin: Twin, pose: Pose | None) -> Pose | PosePrior | None:
+def camera_of(twin: Twin, pose: Pose | None, *, is_fitted: bool = False) -> Pose | PosePrior | None:
     """A start as the configuration wants it: known, or an unknown near it.
 
     Args:
         twin: the twin; `config.registration.pose` says which.
         pose: the start; None where none was given: the camera's coordinates are the body's.
+        is_fitted: the start comes from landmarks on the organ as the camera has seen it; see `Twin.about`.
     """
     wanted = twin.config.registration.pose
     if wanted == "unknown" or (wanted == "auto" and pose is not None):
-        return twin.near(pose or Pose.identity())
+        return twin.about(pose) if is_fitted and pose is not None else twin.near(pose or Pose.identity())
     return pose
 
 

@@ -74,6 +74,7 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
         "targets": list(body.inner),
         "model_error": _model_error(record.get("model_error", record.get("doubt", {}))),
         "drafted": any("draft" in row for row in rows),
+        "has_free_pose": any("camera_margin95_m" in target for row in rows for target in row["targets"].values()),
         "estimates": lambda row: [describe_estimate(estimate) for estimate in row.get("estimates", ())],
         "together": [describe_estimate(estimate) for estimate in record.get("together", ())],
         "bounded": next((row["network"]["confidence"] for row in rows if "network" in row), None),

@@ -56,6 +56,8 @@ Ints = NDArray[np.int64]
 
 Engine = Registrar | HybridRegistrar | ContactRegistrar
 MODEL_ERROR = "model_error.npz"  # in a twin: covariance of its model-error ensemble
+# Of a pose of which nothing is believed: radians, body sizes. With two thirds or twice as much margins change by 2 %.
+_OPEN_ROTATION, _OPEN_TRANSLATION = float(np.deg2rad(30.0)), 0.2
 FORMER_MODEL_ERROR = "doubt.npz"  # the name of that file before
 Camera = Pose | PosePrior | Literal["align"] | None
 """Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
@@ -78,6 +80,7 @@ class Frame:
         seconds: wall time, that of a search for the pose included.
         cloud: points that were used, after thinning, (p, 3), metres; None as above.
         landmarks: how many pulled beside the cloud.
+        missing: rows of the cloud that were passed over: zeros, where a depth camera has measured nothing.
     """
 
     number: int
@@ -86,6 +89,7 @@ class Frame:
     seconds: float
     cloud: Floats | None = None
     landmarks: int = 0
+    missing: int = 0
 
 
 class Twin:
@@ -309,7 +313,7 @@ class Twin:
     def _posed_result(
         self, cloud: ArrayLike, zone: str | None, camera: Camera, run: Callable[[Engine, Floats], Registration]
     ) -> Registration:
-        points = np.asarray(cloud, dtype=np.float64)
+        points = Cloud.of(cloud).array()  # rows of zeros are none before they are turned
         if isinstance(camera, Pose):
             back = camera.inverse()
             return replace(run(self.registrar(zone), turned(points, back.rotation, back.translation)), pose=camera)
@@ -372,7 +376,7 @@ class Twin:
         found = align(Surface(outer(self.body).rest.points, self._seen), Cloud.of(cloud).points)
         if not found.is_found:
             raise CloudError(f"cloud: the pose was not found ({found.outcome.value}). {found.outcome.advice}")
-        return self.near(found.pose)
+        return self.about(found.pose)
 
     @property
     def _seen(self) -> Ints:
@@ -383,6 +387,15 @@ class Twin:
         """An unknown pose about an expected one, with the deviations of the configuration."""
         options = self.config.registration
         return PosePrior(pose, self._middle, np.deg2rad(options.pose_rotation), options.pose_translation)
+
+    def about(self, pose: Pose) -> PosePrior:
+        """An unknown pose about one that was fitted to the moved organ itself: to its cloud, or to landmarks on it.
+
+        Such a pose follows the organ's own movement as far as it can. Believed beforehand to be near the true one, it
+        would count what the camera sees twice, and forces would be found too small. It is a place to begin; what is
+        believed of the pose is as good as nothing.
+        """
+        return PosePrior(pose, self._middle, _OPEN_ROTATION, _OPEN_TRANSLATION * self.body.size)
 
     @cached_property
     def as_said(self) -> PosePrior | None:
@@ -508,7 +521,8 @@ class Sequence:
         """
         begin = time.perf_counter()
         try:
-            points = self._thinned(cloud)
+            given = self._thinned(cloud)
+            points = given.array()
             if self.camera == "align":
                 self.camera = self.twin.aligned(points)
             result = self.twin.follow(points, self.zone, self._last, self.camera, until, landmarks)
@@ -517,12 +531,13 @@ class Sequence:
         if result.judgement.is_usable:
             self._last = result
         count = 0 if landmarks is None else len(np.asarray(landmarks[0]))
-        return Frame(self._next(), result.judgement, result, time.perf_counter() - begin, points[:, :3], count)
+        seconds = time.perf_counter() - begin
+        return Frame(self._next(), result.judgement, result, seconds, points[:, :3], count, given.missing)
 
-    def _thinned(self, cloud: ArrayLike) -> Floats:
+    def _thinned(self, cloud: ArrayLike) -> Cloud:
         """Once for all that is tried with it; what is no cloud is left for the registrar to refuse."""
         given = Cloud.of(cloud)
-        return (given.thinned(self.twin.config.registration.points) if given.is_finite else given).array()
+        return given.thinned(self.twin.config.registration.points) if given.is_finite else given
 
     def refuse(self, reason: str, seconds: float = 0.0) -> Frame:
         """The next frame without a result: its cloud cannot be used.

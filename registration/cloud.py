@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from softtwin.meshes.clouds import CloudError
 from .thinning import thinned
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 _POINTS, _ORIENTED = 3, 6  # columns
 
 
@@ -23,14 +24,19 @@ class Cloud:
     Args:
         points: (p, 3), metres.
         normals: of any length and of either sign, (p, 3); a row of zeros where none was measured. None for none at all.
+        missing: rows that were passed over, since they are places where a camera has measured nothing.
     """
 
     points: Floats
     normals: Floats | None = None
+    missing: int = 0
 
     @classmethod
     def of(cls, cloud: ArrayLike) -> Cloud:
         """The cloud in an array; what is no cloud is left for `check_cloud` to refuse.
+
+        Depth cameras write zeros for pixels without a measurement. Of measured numbers no two are the origin to the
+        last bit: rows of zeros that come more than once are none, and one alone is taken as it is.
 
         Args:
             cloud: points, (p, 3), metres; with normals behind their coordinates (p, 6), NaN where none was measured.
@@ -39,13 +45,18 @@ class Cloud:
             CloudError: six columns of which the last three tell no direction at all.
         """
         table = np.asarray(cloud, dtype=np.float64)
-        if table.ndim != 2 or table.shape[1] != _ORIENTED or not len(table):
+        if table.ndim != 2 or table.shape[1] not in (_POINTS, _ORIENTED) or not len(table):
             return cls(table)
+        is_zero = ~table[:, :3].any(axis=1)
+        missing = int(is_zero.sum()) if is_zero.sum() > 1 else 0
+        table = table[~is_zero] if missing else table
+        if table.shape[1] == _POINTS or not len(table):
+            return cls(table[:, :3], None, missing)
         points, normals = np.ascontiguousarray(table[:, :3]), table[:, 3:].copy()
         normals[~np.isfinite(normals).all(axis=1)] = 0.0
         if not normals.any():
             raise CloudError("cloud: expected normals in its last three columns, got none that is not zero or NaN.")
-        return cls(points, normals)
+        return cls(points, normals, missing)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -63,8 +74,7 @@ class Cloud:
         """
         if len(self) <= maximum:
             return self
-        kept = thinned(self.points, maximum)
-        return Cloud(self.points[kept], None if self.normals is None else self.normals[kept])
+        return self._of(thinned(self.points, maximum))
 
     def distinct(self) -> Cloud:
         """Each place once: a point that is there again tells nothing more. The same where none is."""
@@ -72,8 +82,11 @@ class Cloud:
         is_again = (np.diff(self.points[order], axis=0) == 0.0).all(axis=1)
         if not is_again.any():
             return self
-        kept = np.setdiff1d(np.arange(len(self)), order[1:][is_again])
-        return Cloud(self.points[kept], None if self.normals is None else self.normals[kept])
+        return self._of(np.setdiff1d(np.arange(len(self)), order[1:][is_again]))
+
+    def _of(self, kept: Ints) -> Cloud:
+        """Some of the points, by their numbers."""
+        return replace(self, points=self.points[kept], normals=None if self.normals is None else self.normals[kept])
 
     @cached_property
     def tangent_basis(self) -> Floats | None:

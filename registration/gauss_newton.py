@@ -17,7 +17,7 @@ from softtwin.reference.data.outcome import NotConverged
 from . import landmarks
 from .correlated import find_correlated
 from .hyperparameters import Hyperparameters, estimate_hyperparameters, linearised
-from .loss import Huber, Loss, Tukey, robust_deviation
+from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .posterior import Posterior, posterior
 from .problem import Evaluation, Problem
@@ -82,6 +82,17 @@ class SolverResult:
     ) -> SolverResult:
         """What is found where a model of the objective was taken."""
         return cls(local.evaluation, local.weights, local.posterior(), outcome, evaluations, trace, local)
+
+    @property
+    def is_kept(self) -> NDArray[np.bool_]:
+        """True of the points that count, (p,): all but outliers, which pulled nothing."""
+        return self.weights >= REJECTED
+
+    @property
+    def rms_distance(self) -> float:
+        """Root mean square distance of the points that count, metres; of all where none does."""
+        distances = self.evaluation.match.distances
+        return float(np.sqrt(np.mean((distances[self.is_kept] if self.is_kept.any() else distances) ** 2)))
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+REJECTED = 0.05  # weight of a point; with less it pulled nothing, and no figure of the fit counts it
 _QUADRATURE = np.linspace(-8.0, 8.0, 4001)  # standard deviations
 
 

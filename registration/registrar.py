@@ -185,15 +185,15 @@ class Registrar:
             return found
         match = found.evaluation.match  # with those points that were taken for outliers: patches of them are none
         inflation_factor = shared(self.observed.closest_points(match), match.distances, np.ones(len(match.distances)))
-        is_missed = found.rms_distance * np.sqrt(inflation_factor) > _MISSED * self.noise.minimum
+        is_missed = match.rms * np.sqrt(inflation_factor) > _MISSED * self.noise.minimum
         if not is_missed or self._is_late:
             return found
         with suppress(NotConverged):
             other = self.anywhere().limited(self.options.solver.until).with_landmarks(self.landmarks).register(cloud)
-            if other.judgement.is_usable and other.rms_distance < _EXPLAINED * found.rms_distance:
+            if other.judgement.is_usable and other.evaluation.match.rms < _EXPLAINED * match.rms:
                 reason = (
-                    f"forces outside the zone explain the cloud better: points lie {1e3 * found.rms_distance:.2f} mm "
-                    f"from the surface, with forces anywhere {1e3 * other.rms_distance:.2f} mm"
+                    f"forces outside the zone explain the cloud better: points lie {1e3 * match.rms:.2f} mm "
+                    f"from the surface, with forces anywhere {1e3 * other.evaluation.match.rms:.2f} mm"
                 )
                 return found.with_reason(reason)
         return found
@@ -232,7 +232,7 @@ class Registrar:
     def _followed(self, points: Cloud, start: Registration, begin: float) -> Registration:
         """From the frame before, or from rest with its forces."""
         points = self._enough(points)
-        problem = self._problem(points, start.prepared, start.evaluation, start.discrepancy_scale)
+        problem = self._problem(points, start.prepared, start, start.discrepancy_scale)
         near = problem.begun(problem.carried(start.evaluation.coefficients, start.problem), start.evaluation)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
             found = self._from_rest(points, start.prepared, self.options.solver)
@@ -335,7 +335,7 @@ class Registrar:
         return self._finished(points, prepared, found, begin)
 
     def _carried_on(self, points: Cloud, fast: ForwardModel, last: Registration, begin: float) -> Registration:
-        problem = self._problem(points, last.prepared, last.evaluation, last.discrepancy_scale)
+        problem = self._problem(points, last.prepared, last, last.discrepancy_scale)
         solver = self.options.solver.following()
         near = replace(last.evaluation, coefficients=problem.carried(last.evaluation.coefficients, last.problem))
         found = self._approached(problem, near, fast, solver)
@@ -414,12 +414,14 @@ class Registrar:
             correlated=self.correlated,
         )
 
-    def _problem(self, points: Cloud, prepared: Prepared, near: Evaluation, discrepancy_scale: float = 1.0) -> Problem:
+    def _problem(
+        self, points: Cloud, prepared: Prepared, near: SolverResult | Registration, discrepancy_scale: float = 1.0
+    ) -> Problem:
         """The problem with the model's error in patterns, of the size that belongs to a movement like a trial's."""
         plain = self._plain(points, prepared)
         if self.error is None:
             return plain
-        moved = np.linalg.norm(near.positions, axis=1).max() + near.match.rms
+        moved = np.linalg.norm(near.evaluation.positions, axis=1).max() + near.rms_distance
         error = replace(self.error, size=discrepancy_scale * float(moved))
         return replace(plain, error=error, noise=self.options.noise)
 
@@ -478,7 +480,7 @@ class Registrar:
         if is_hopeless:
             solver = solver.without_steps()
         believed = prepared if self.error is not None else self._believed(prepared, found)
-        problem = self._problem(points, believed, found.evaluation)
+        problem = self._problem(points, believed, found)
         is_settled = is_settled and believed is prepared and len(found.evaluation.cloud) == len(points)
         if self.error is not None or not is_settled:
             errors = np.zeros(problem.size - len(found.evaluation.coefficients))
@@ -600,8 +602,8 @@ class Registrar:
             net_force_covariance=covariance,
             noise=found.posterior.scales.noise,
             force_scale=found.posterior.scales.force,
-            rms_distance=evaluation.match.rms,
-            outliers=float(np.mean(found.weights < 0.05)),
+            rms_distance=found.rms_distance,
+            outliers=float(np.mean(~found.is_kept)),
             informed=found.posterior.informed,
             points=len(problem.cloud),
             outcome=found.outcome,
@@ -725,7 +727,7 @@ def _is_shared(found: Registration, minimum: float) -> bool:
     """Whether neighbours share of what a cloud has left more than the least noise, and more than chance has them."""
     match = found.evaluation.match
     part = shared(found.problem.observed.closest_points(match), match.distances, np.ones(len(match.distances)))
-    return part > _ALIKE and found.rms_distance * np.sqrt(part) > minimum
+    return part > _ALIKE and match.rms * np.sqrt(part) > minimum
 
 
 def _noise_of(found: Registration, size: float, length: float) -> CorrelatedNoise:

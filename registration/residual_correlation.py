@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from .loss import REJECTED
+
 Floats = NDArray[np.float64]
 _ASKED = 100  # points whose correlation with all others is looked at
 _RINGS = 24
@@ -27,7 +29,7 @@ def variance_inflation(closest_points: Floats, scaled: Floats, weights: Floats) 
         scaled: residuals over their deviations, (p,).
         weights: of the points, (p,); those without weight are left out.
     """
-    kept = weights > 0.05
+    kept = weights > REJECTED
     places, values = closest_points[kept], scaled[kept]
     square = float((values**2).mean()) if len(values) else 0.0
     extrapolation_ratio = float(np.linalg.norm(np.ptp(places, axis=0))) if len(values) else 0.0

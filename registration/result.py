@@ -11,13 +11,14 @@ from scipy.stats import chi2
 
 from .forward import State
 from .gauss_newton import IterationRecord, LocalModel
+from .loss import REJECTED
 from .outcome import Outcome
 from .parameter_blocks import Estimate
 from .pose import Pose
 from .posterior import Posterior
 from .prepared import Prepared
 from .problem import Evaluation, Problem
-from .uncertainty import Uncertainty, uncertainty
+from .uncertainty import CoordinateFrame, Uncertainty, uncertainty
 from .verdict import Judgement, Verdict
 
 Floats = NDArray[np.float64]
@@ -42,8 +43,8 @@ class Registration:
         net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
         noise: standard deviation of a point's distance that was found, metres.
         force_scale: standard deviation of the force coefficients that was found, newtons.
-        rms_distance: of the cloud to the registered surface, metres.
-        outliers: share of the points that pulled nothing.
+        rms_distance: of the cloud to the registered surface, metres, without the outliers.
+        outliers: share of the points that pulled nothing: no other figure of the fit counts them.
         informed: number of likelihood-informed directions of force and pose.
         points: points that were used, after thinning.
         outcome: how the solver ended.
@@ -157,14 +158,52 @@ class Registration:
         covariance = self.posterior.net_force_covariance(slopes, problem.forces.left_out / modulus**2)
         return self.net_force / modulus, np.sqrt(np.diag(covariance))
 
+    @property
+    def left_out(self) -> int:
+        """Number of the points that pulled nothing."""
+        return round(self.outliers * self.points)
+
+    @property
+    def explained(self) -> Floats:
+        """The points used without these, (q, 3), metres, in the coordinates in which positions are told."""
+        points, local = self.problem.cloud, self.local
+        kept = points if local is None else points[local.weights >= REJECTED]
+        return kept if self.problem.pose is None else self.pose.inverse().apply(kept)
+
+    @property
+    def has_free_pose(self) -> bool:
+        """Whether a pose was found that nobody said to be known: positions in the two frames differ by it."""
+        return self.problem.pose is not None and not self.problem.pose.is_said
+
+    @property
+    def frame(self) -> CoordinateFrame:
+        """In which the displacement is told: the body's, or the camera's where the pose was said to be known.
+
+        In the latter what the pose is off by counts as displacement, and `pose` is the one that was said.
+        """
+        return "camera" if self.problem.pose is not None and self.problem.pose.is_said else "body"
+
     @cached_property
     def uncertainty(self) -> Uncertainty:
-        """How far each point of the body may be from where it was found; computed when it is first asked for.
+        """How far each point may be from where it is told, `x + displacement`; computed when it is first asked for.
 
         It holds for what the problem reckons with: noise, forces like those expected, the model's error where its
         patterns are known. Wrong stiffness, attachment or shape of the body are not among them.
         """
+        if self.frame == "camera":
+            return self.camera_uncertainty.turned(self.pose.rotation.T)
         return uncertainty(self.problem, self.evaluation, self.posterior, self.prepared.unseen)
+
+    @cached_property
+    def camera_uncertainty(self) -> Uncertainty:
+        """The same of where the camera sees each point, `pose.apply(x + displacement)`, on the camera's axes.
+
+        Where the pose is unknown it may be far less than `uncertainty`: a cloud that does not tell a turn of the organ
+        from forces that bend it as far shows all the same where its points are.
+        """
+        if self.problem.pose is None:  # the cloud was brought to the body by a pose that is exact
+            return self.uncertainty.turned(self.pose.rotation)
+        return uncertainty(self.problem, self.evaluation, self.posterior, self.prepared.unseen, "camera")
 
 
 def badness(result: Registration) -> tuple[int, float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import cast
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,17 @@ from .priors import NodalForces
 from .problem import Evaluation, Problem
 
 Floats = NDArray[np.float64]
+CoordinateFrame = Literal["body", "camera"]  # what is attached to the organ's support lies still, or what the camera is
 _DRAWN = 64  # combinations that stand for all directions that were left out
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """A normal law of the displacement, with that of the pose where this is unknown, about what was found.
+    """A normal law of where the nodes are in one coordinate frame, about where they were found.
 
-    The covariance is F F^T, and the square of a deviation of its own for each component of each node.
+    The covariance is F F^T, and the square of a deviation of its own for each component of each node. A position that
+    is given in another frame has another law: of what a cloud in the camera's coordinates shows, the place in these may
+    be known well, and how much of it is the pose's and how much the displacement's may be known badly.
 
     Args:
         factor: F, (3n, r), metres.
@@ -41,7 +44,7 @@ class Uncertainty:
     rest: Floats
 
     def covariances(self, points: Embedding | None = None) -> Floats:
-        """Of the displacement of each point, (p, 3, 3), metres^2, on the body's axes.
+        """Of the position of each point, (p, 3, 3), metres^2, on the axes of the frame.
 
         Args:
             points: carried by the body; the nodes if not given.
@@ -55,6 +58,14 @@ class Uncertainty:
         every = factor @ factor.transpose(0, 2, 1)
         every[:, range(3), range(3)] += np.square(rest)[:, None]
         return every
+
+    def turned(self, rotation: Floats) -> Uncertainty:
+        """The same on other axes.
+
+        Args:
+            rotation: from these axes to the others, (3, 3).
+        """
+        return Uncertainty(_turned(rotation, self.factor), self.rest)
 
     @cached_property
     def _of_nodes(self) -> Floats:
@@ -116,30 +127,63 @@ def unseen_response(model: ReducedModel, forces: NodalForces) -> Floats:
     return np.asarray(model.solve(np.zeros(model.count)).full.jvp(directions))
 
 
-def uncertainty(problem: Problem, evaluation: Evaluation, posterior: Posterior, unseen: Floats) -> Uncertainty:
-    """What is known of the displacement where a solver ended.
+def uncertainty(
+    problem: Problem,
+    evaluation: Evaluation,
+    posterior: Posterior,
+    unseen: Floats,
+    frame: CoordinateFrame = "body",
+) -> Uncertainty:
+    """What is known of where the nodes are, where a solver ended, in one coordinate frame.
+
+    All unknowns have one posterior, with the correlations of pose and displacement. In the body's frame the position is
+    x + u, which no pose moves: what the cloud does not tell of the pose is in it by the forces that would make up for
+    it. In the camera's it is y = R (x + u) + t, with the derivatives of all.
 
     Args:
         problem: what was registered.
         evaluation: where.
         posterior: there.
         unseen: response to the directions of force that were left out, as from `unseen_response`.
+        frame: of the positions: `body`, in which what holds the organ lies still, or `camera`, that of the cloud. They
+            are one where no pose is unknown.
     """
-    state = evaluation.state.full
-    blocks = [problem.stiffness_scaling(evaluation)[0] * state.jvp(problem.forces.basis)] if problem.forces.size else []
-    if problem.pose is not None and evaluation.pose is not None:
-        places = problem.observed.body.points + state.displacement + problem.correction(evaluation)
-        in_camera = problem.pose.jacobian(evaluation.coefficients[problem.pose_part], places)
-        blocks.append(np.einsum("ji,njk->nik", evaluation.pose.rotation, in_camera).reshape(-1, 6))
-    if problem.parameter_blocks is not None:
-        blocks.append(cast(ParametrisedState, evaluation.state).by_parameters())
     rest = np.zeros(len(problem.observed.body.points))
     if problem.error is not None:
-        blocks.append(problem.error.size * problem.error.discrepancy.modes)
         rest = problem.error.size * problem.error.discrepancy.rest
     if not np.isfinite(posterior.covariance).all():  # of a cloud that tells nothing that could be believed
         return Uncertainty(np.zeros((3 * len(rest), 1)), np.full(len(rest), np.inf))
-    noise = np.arange(problem.size)[problem.noise_part]  # which moves no node
-    values, vectors = np.linalg.eigh(np.delete(np.delete(posterior.covariance, noise, axis=0), noise, axis=1))
+    slopes, moving = _by_unknowns(problem, evaluation), np.ones(problem.size, dtype=bool)
+    moving[problem.noise_part] = False
+    if frame == "camera" and problem.pose is not None and evaluation.pose is not None:
+        places = problem.observed.body.points + evaluation.state.full.displacement + problem.correction(evaluation)
+        slopes, unseen = _turned(evaluation.pose.rotation, slopes), _turned(evaluation.pose.rotation, unseen)
+        by_pose = problem.pose.jacobian(evaluation.coefficients[problem.pose_part], places)
+        slopes[:, problem.pose_part] = by_pose.reshape(-1, by_pose.shape[2])
+    else:
+        moving[problem.pose_part] = False
+    values, vectors = np.linalg.eigh(posterior.covariance[np.ix_(moving, moving)])  # the others are integrated out
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return Uncertainty(np.hstack([np.hstack(blocks) @ root, posterior.scales.force * unseen]), rest)
+    return Uncertainty(np.hstack([slopes[:, moving] @ root, posterior.scales.force * unseen]), rest)
+
+
+def _by_unknowns(problem: Problem, evaluation: Evaluation) -> Floats:
+    """Derivative of the displacement of all nodes by the coefficients, (3n, k), metres, on the body's axes.
+
+    Those of pose and correlated noise move no node.
+    """
+    state = evaluation.state.full
+    slopes = np.zeros((problem.observed.body.points.size, problem.size))
+    if problem.forces.size:
+        slopes[:, problem.force_part] = problem.stiffness_scaling(evaluation)[0] * state.jvp(problem.forces.basis)
+    if problem.parameter_blocks is not None:
+        slopes[:, problem.parameter_part] = cast(ParametrisedState, evaluation.state).by_parameters()
+    if problem.error is not None:
+        slopes[:, problem.error_part] = problem.error.size * problem.error.discrepancy.modes
+    return slopes
+
+
+def _turned(rotation: Floats, columns: Floats) -> Floats:
+    """Nodal vectors, (3n, k), on other axes."""
+    turned = np.einsum("ij,njk->nik", rotation, columns.reshape(len(columns) // 3, 3, columns.shape[1]))
+    return turned.reshape(columns.shape)

@@ -15,6 +15,7 @@ from .forward import ForwardModel, State
 from .gauss_newton import SolverResult
 from .hyperparameters import LogNormalPrior
 from .identifiability import uninformed
+from .loss import REJECTED
 from .outcome import Outcome
 from .problem import Problem
 
@@ -184,10 +185,10 @@ def _of_the_fit(problem: Problem, found: SolverResult, expected: Expectations) -
             (verdict, f"organ and cloud do not match: whole patches of the surface are {1e3 * systematic:.1f} mm off, "
                       f"which no noise of points explains (up to {1e3 * expected.systematic:.1f} mm is let pass)")
         )  # fmt: skip
-    outliers = float(np.mean(found.weights < 0.05))
+    outliers = float(np.mean(~found.is_kept))
     if outliers > expected.outliers:
         findings.append((Verdict.DOUBTFUL, f"{100 * outliers:.0f} % of the points fit nowhere"))
-    elif outliers > _MUCH and thickness(found.evaluation.cloud[found.weights < 0.05]) < _THIN:
+    elif outliers > _MUCH and thickness(found.evaluation.cloud[~found.is_kept]) < _THIN:
         findings.append(
             (Verdict.DOUBTFUL, f"{100 * outliers:.0f} % of the points are a surface that is none of this organ's: "
                                "something else is in the cloud")
@@ -214,7 +215,7 @@ def shared(closest_points: Floats, distances: Floats, weights: Floats) -> float:
         distances: signed, (p,), metres.
         weights: of the points, (p,); those without weight are left out.
     """
-    kept = weights > 0.05
+    kept = weights > REJECTED
     points, values = closest_points[kept], distances[kept]
     count = min(_NEIGHBOURS, len(points) - 1)
     if count < 1 or not values.any():

@@ -211,7 +211,7 @@ class Session:
     def _paint(self, found: Registration, frame: Frame, shot: Shot, wishes: Wishes, twin: Twin) -> None:
         cloud = None if frame.cloud is None else found.pose.inverse().apply(frame.cloud)
         self.picture.show_cloud(cloud)
-        values = shown_values(wishes.shows, twin.body, found, cloud, shot.truth)
+        values = shown_values(wishes.shows, twin.body, found, shot.truth)
         self.picture.paint(values, SCALES[wishes.shows])
 
     # The pull.

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 def margins_of(twin: Twin, found: Registration) -> dict[str, float]:
-    """The largest 95 % margin of each inner structure, metres, by name."""
+    """The largest 95 % margin of each inner structure where it is shown, metres, by name."""
     known = found.uncertainty
     return {name: float(known.margin(points).max()) for name, points in twin.embeddings.items()}
 
@@ -38,16 +38,13 @@ def errors_of(twin: Twin, found: Registration, truth: Floats | None) -> dict[str
     }
 
 
-def shown_values(
-    shows: str, body: Body, found: Registration, cloud: Floats | None, truth: Floats | None
-) -> Floats | None:
+def shown_values(shows: str, body: Body, found: Registration, truth: Floats | None) -> Floats | None:
     """What the colours show at the nodes, (n,), metres, NaN where nothing is told; None where that is nowhere.
 
     Args:
         shows: a word of `bands.SCALES`.
         body: at rest.
         found: the registration.
-        cloud: in the body's coordinates, (p, 3), metres.
         truth: true nodal displacements, (n, 3), metres.
     """
     if shows == "error":
@@ -56,7 +53,7 @@ def shown_values(
         return np.asarray(found.uncertainty.margin())
     if shows == "movement":
         return np.linalg.norm(found.displacement, axis=1)
-    return None if cloud is None else near_cloud(body, found.displacement, cloud)
+    return near_cloud(body, found.displacement, found.explained)
 
 
 def near_cloud(body: Body, displacement: Floats, cloud: Floats) -> Floats:

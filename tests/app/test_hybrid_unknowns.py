@@ -55,7 +55,7 @@ def test_a_ratio_and_a_pose_are_found_beside_the_forces(small_quickstart: Path) 
     true = Pose.identity().moved(np.array([0.02, -0.01, 0.02, 2e-3, -1e-3, 2e-3]), body.points.mean(axis=0))
     with Twin.open(small_quickstart, "hybrid", parameters=("poisson-ratio",)) as twin:
         found = twin.register(true.apply(seen(body, truth)), "", camera=twin.near(Pose.identity()))
-        deviation = found.uncertainty.deviation.mean()
+        deviation = found.camera_uncertainty.deviation.mean()
     assert found.judgement.verdict is Verdict.ACCEPTED, found.judgement.reasons
     assert found.draft is not None and not found.draft.estimates  # the network knows of no ratio
     (ratio,) = found.estimates

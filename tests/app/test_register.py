@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista as pv
 
 from softtwin.app.config import Config, ConfigError
 from softtwin.app.landmarks import camera_from_landmarks
@@ -174,6 +175,12 @@ def test_a_start_is_an_unknown_unless_said_otherwise(plain_twin: Twin, wanted: s
     assert not isinstance(camera, PosePrior) or camera.rotation_deviation == pytest.approx(np.deg2rad(2.0))
 
 
+def test_of_a_start_that_was_fitted_to_the_moved_organ_nothing_is_believed(plain_twin: Twin) -> None:
+    near, about = (camera_of(plain_twin, Pose.identity(), is_fitted=fitted) for fitted in (False, True))
+    assert isinstance(near, PosePrior) and isinstance(about, PosePrior) and not about.is_said
+    assert (about.deviations > 5.0 * near.deviations).all()
+
+
 # --- What is written.
 
 
@@ -185,6 +192,30 @@ def test_a_camera_that_is_seen_to_stand_elsewhere_is_said(plain_twin: Twin, clou
     assert ("degrees from where it was said" in lines[0]) == (off > 0.0)
     if off:
         assert 0.2 * off < row["pose_correction"]["translation_m"] < 2.0 * off
+
+
+def test_rows_of_zeros_are_passed_over_and_counted_apart(plain_twin: Twin, cloud, forces, tmp_path: Path) -> None:
+    """A depth camera's missing pixels: the frame is the same with them and without, in every figure and file."""
+    moved = plain_twin.body.points + plain_twin.predict(forces).displacement
+    pose = Pose.identity().moved(np.array([0.3, -0.2, 0.5, 0.05, 0.1, 0.4]), np.zeros(3))
+    start = pose.moved(np.array([0.02, -0.03, 0.01, 3e-3, -2e-3, 4e-3]), pose.apply(moved).mean(axis=0))
+    seen, lines = pose.apply(cloud), list[str]()
+    holed = np.insert(seen, np.random.default_rng(0).integers(len(seen), size=3000), 0.0, axis=0)
+    rows = {}
+    for name, given in (("whole", seen), ("holed", holed)):
+        rows[name] = register_clouds(
+            plain_twin, [given], tmp_path / name, camera=plain_twin.near(start), truth=moved[None], say=lines.append
+        )[0]
+    whole, row = rows["whole"], record_of(tmp_path / "holed")["frames"][0]
+    assert row.pop("points_missing") == 3000 and "points_missing" not in whole
+    assert row["points"] == 400 and row["points_left_out"] == 0 and row["rms_distance_m"] < 1e-3
+    for entry in ("rms_distance_m", "noise_m", "outliers", "points_alike", "informed", "targets"):
+        assert row[entry] == whole[entry], entry
+    assert row["margins_in"] == "body"
+    target = row["targets"]["tumour"]
+    assert target["error_m"] < target["margin95_m"] and target["camera_margin95_m"] < target["margin95_m"]
+    assert "3000 rows of zeros passed over" in lines[1] and "in the camera's coordinates)" in lines[1]
+    assert pv.read(tmp_path / "holed" / "cloud_0000.vtp").n_points == 400
 
 
 def test_every_frame_is_written_with_its_verdict(plain_twin: Twin, cloud, forces, tmp_path: Path) -> None:

@@ -159,9 +159,11 @@ def test_an_unknown_pose_adds_to_it(body: Body, rng: np.random.Generator) -> Non
     plain, posed = registrar(body), registrar(body, prior)
     truth = plain.model.solve(plain.forces.forces(np.full(plain.forces.size, 0.5 * FORCE))).displacement
     cloud = cloud_on(body, truth, 300, rng, NOISE)
-    known, unknown = (made.register(cloud).uncertainty for made in (plain, posed))
-    assert unknown.deviation[body.fixed].min() > 0.0
-    assert unknown.deviation.mean() > known.deviation.mean()
+    known, unknown = (made.register(cloud) for made in (plain, posed))
+    assert unknown.uncertainty.deviation[body.fixed].max() == 0.0  # in the body's frame they lie still
+    assert unknown.camera_uncertainty.deviation[body.fixed].min() > 0.0
+    for law in (unknown.uncertainty, unknown.camera_uncertainty):
+        assert law.deviation.mean() > known.uncertainty.deviation.mean()
 
 
 def test_directions_that_were_left_out_are_doubted_still(body: Body, rng: np.random.Generator) -> None:
