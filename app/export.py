@@ -129,6 +129,8 @@ class Exporter:
             rest = self.twin.body.inner[name] if name in self.twin.body.inner else outer(self.twin.body).rest
             outward = Surface(place.lengths(surface.points), surface.triangles)
             shift = {"displacement": place.lengths(surface.points - rest.points)}
+            if name in self.twin.outside and (outside := self.twin.outside[name]).any():
+                shift["is_known"] = (~outside).astype(np.uint8)
             for kind in self._kinds:
                 names.append(f"{self._names.get(name, 'organ')}_{number:04d}.{kind}")
                 write_surface(self.folder / names[-1], outward, shift, place)

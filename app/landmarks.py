@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.io import TURN, FileError
+from softtwin.meshes.io import RAS_TO_LPS, FileError
 from softtwin.meshes.io.landmarks import SUFFIXES, read_named_points
 from softtwin.registration.landmarks import LandmarkPairs
 from softtwin.registration.pose import LandmarkFit, from_landmarks
@@ -137,5 +137,5 @@ def _read(path: Path, coordinates: Coordinates) -> dict[str, Floats]:
     found = read_named_points(path, coordinates.unit)
     if found.axes is None:
         return {name: coordinates.directions(place) for name, place in found.points.items()}
-    turn = TURN if found.axes == "ras" else np.ones(3)
+    turn = RAS_TO_LPS if found.axes == "ras" else np.ones(3)
     return {name: turn * place for name, place in found.points.items()}

@@ -25,7 +25,7 @@ from softtwin.meshes.attachment import (
 )
 from softtwin.meshes.body import Body, BodyError, Surface
 from softtwin.meshes.components import check_component
-from softtwin.meshes.embedding import embed
+from softtwin.meshes.embedding import embed, is_carried_along
 from softtwin.meshes.grid import gridded
 from softtwin.meshes.io import (
     LARGEST,
@@ -55,7 +55,6 @@ Floats = NDArray[np.float64]
 SHAPES: dict[str, Callable[..., Body]] = {"liver-phantom": liver_phantom, "propeller": propeller, "beam": beam}
 _COARSEST = 0.2  # of the body's size: the edge of a grid's cells
 _LONG = 2.0  # edges of a mesh of n nodes in a volume V are shorter than this times (V / n)^(1/3)
-_TOUCHING = 1e-3  # of the body's size: nearer to it a point outside is round-off of the mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,8 +270,8 @@ def _outside(body: Body, name: str, surface: Surface) -> list[str]:
     Raises:
         BodyError: no part of it lies inside.
     """
-    outside = embed(body, surface.points).outside
-    share = float((outside > _TOUCHING * body.size).mean())
+    carried = embed(body, surface.points)
+    outside, share = carried.outside, float(is_carried_along(body, carried).mean())
     if share == 1.0:
         raise BodyError(
             f"body.inner.{name}: expected a surface inside the organ, got all of its vertices outside, "

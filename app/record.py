@@ -216,12 +216,14 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
     known = result.uncertainty
     row["margins_in"] = result.frame
     row["deviation_m"] = {"mean": float(known.deviation.mean()), "largest": float(known.deviation.max())}
-    row["targets"] = {
-        name: {"movement_m": _mean_length(vectors), "margin95_m": float(known.margin(twin.embeddings[name]).max())}
-        for name, vectors in moved.items()
-    }
-    for name, target in row["targets"].items() if result.has_free_pose else ():
-        target["camera_margin95_m"] = float(result.camera_uncertainty.margin(twin.embeddings[name]).max())
+    row["targets"] = {name: {"movement_m": _mean_length(vectors)} for name, vectors in moved.items()}
+    for name, target in row["targets"].items():
+        target["margin95_m"] = _largest(known.margin(twin.embeddings[name]), twin.outside[name])
+        if result.has_free_pose:
+            margins = result.camera_uncertainty.margin(twin.embeddings[name])
+            target["camera_margin95_m"] = _largest(margins, twin.outside[name])
+        if twin.outside[name].any():
+            target["outside_share"] = float(twin.outside[name].mean())
     if truth is not None:
         rest = twin.body.points
         row["error"] = asdict(target_errors(rest + result.displacement, truth))
@@ -309,8 +311,15 @@ def describe(row: Mapping[str, Any]) -> str:
         line += f", {name} moved {millimetres(target['movement_m'], 1)} ± {millimetres(target['margin95_m'], 1)}"
         seen = target.get("camera_margin95_m")
         line += "" if seen is None else f" (± {millimetres(seen, 1)} in the camera's coordinates)"
+        share = target.get("outside_share")
+        line += "" if share is None else f" where it is inside the organ ({100 * share:.0f} % is not, and not known)"
         line += f" ({millimetres(target['error_m'])} off)" if "error_m" in target else ""
     return line
+
+
+def _largest(margins: Floats, outside: NDArray[np.bool_]) -> float:
+    """The largest margin of what lies inside the organ: of the rest nothing is known."""
+    return float(margins[~outside].max(initial=0.0)) if not outside.all() else math.inf
 
 
 def describe_estimate(estimate: Mapping[str, Any]) -> str:

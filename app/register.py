@@ -20,6 +20,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.io import Axes, ContentError, FileError, Unit, is_companion, read_cloud
+from softtwin.meshes.io.clouds import TABLES
 from softtwin.registration.pose import Pose, read_matrix
 from softtwin.registration.priors import PosePrior
 
@@ -35,7 +36,7 @@ from .schema import option_of
 from .twin import Camera, Frame, Twin, coordinates_of
 
 Floats = NDArray[np.float64]
-CLOUDS = (".npy", ".txt", ".csv", ".xyz", ".ply", ".stl", ".obj", ".vtk", ".vtp", ".vtu", ".pcd")
+CLOUDS = (".npy", *TABLES, ".ply", ".stl", ".obj", ".vtk", ".vtp", ".vtu", ".pcd")
 _FAR_OFF = 0.25  # body sizes that fixed nodes of a truth may be off on average
 
 
@@ -333,11 +334,11 @@ def camera_of(twin: Twin, pose: Pose | None, *, is_fitted: bool = False) -> Pose
     Args:
         twin: the twin; `config.registration.pose` says which.
         pose: the start; None where none was given: the camera's coordinates are the body's.
-        is_fitted: the start comes from landmarks on the organ as the camera has seen it; see `Twin.about`.
+        is_fitted: the start comes from landmarks on the organ as the camera has seen it; see `Twin.fitted_prior`.
     """
     wanted = twin.config.registration.pose
     if wanted == "unknown" or (wanted == "auto" and pose is not None):
-        return twin.about(pose) if is_fitted and pose is not None else twin.near(pose or Pose.identity())
+        return twin.fitted_prior(pose) if is_fitted and pose is not None else twin.near(pose or Pose.identity())
     return pose
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.clouds import CloudError
-from softtwin.meshes.embedding import Embedding, outer, target_points
+from softtwin.meshes.embedding import Embedding, is_carried_along, outer, target_points
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.io import read_body
 from softtwin.reference.data.discrepancy import Discrepancy, read_discrepancy
@@ -364,6 +364,11 @@ class Twin:
         """How the body carries the vertices of each inner surface, by name."""
         return target_points(self.body)
 
+    @cached_property
+    def outside(self) -> dict[str, NDArray[np.bool_]]:
+        """Which vertices of each inner surface lie outside the organ, and are carried along, by name."""
+        return {name: is_carried_along(self.body, points) for name, points in self.embeddings.items()}
+
     def aligned(self, cloud: ArrayLike) -> PosePrior:
         """An unknown pose about the one that a cloud alone shows.
 
@@ -376,7 +381,7 @@ class Twin:
         found = align(Surface(outer(self.body).rest.points, self._seen), Cloud.of(cloud).points)
         if not found.is_found:
             raise CloudError(f"cloud: the pose was not found ({found.outcome.value}). {found.outcome.advice}")
-        return self.about(found.pose)
+        return self.fitted_prior(found.pose)
 
     @property
     def _seen(self) -> Ints:
@@ -388,7 +393,7 @@ class Twin:
         options = self.config.registration
         return PosePrior(pose, self._middle, np.deg2rad(options.pose_rotation), options.pose_translation)
 
-    def about(self, pose: Pose) -> PosePrior:
+    def fitted_prior(self, pose: Pose) -> PosePrior:
         """An unknown pose about one that was fitted to the moved organ itself: to its cloud, or to landmarks on it.
 
         Such a pose follows the organ's own movement as far as it can. Believed beforehand to be near the true one, it

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import outer
 from softtwin.meshes.grid import gridded
-from softtwin.meshes.io import read_mesh
+from softtwin.meshes.io import read_volume
 from softtwin.meshes.shapes import beam, liver_phantom
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.samplers import LoadPlan, draw_load, loaded_nodes
@@ -86,7 +86,7 @@ def ranks(body: Body, plan: LoadPlan) -> dict[str, int]:
 def loose_corners() -> dict[str, Any]:
     """Largest movement of a node and of the organ's surface under drawn loads, by the least fraction of a cell."""
     folder = LIVER / "mesh-default"
-    whole = Body(*read_mesh(folder / "liver.msh"), {"fixed": np.load(folder / "dirichlet-vertices.npy")})
+    whole = Body(*read_volume(folder / "liver.msh"), {"fixed": np.load(folder / "dirichlet-vertices.npy")})
     plan, found = PLANS["liver-grid"], {}
     for least in NEARLY_EMPTY:
         body = gridded(whole, cells_per_axis=(24, 21, 20), smallest=least)

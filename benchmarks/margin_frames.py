@@ -145,7 +145,7 @@ def stands(twin: Twin, pose: str, moved: Floats, rng: np.random.Generator) -> tu
         chosen.append(int(seen[away.argmax()]))
     found = said.apply(moved[chosen]) + MARKED * rng.standard_normal((MARKS, 3))
     rest = {str(node): twin.body.points[node] for node in chosen}
-    return said, twin.about(from_landmarks(rest, dict(zip(rest, found, strict=True))).pose)
+    return said, twin.fitted_prior(from_landmarks(rest, dict(zip(rest, found, strict=True))).pose)
 
 
 def one(twin: Twin, pose: str, truth: Floats, seed: int) -> dict[str, Any]:

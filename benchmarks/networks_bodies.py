@@ -24,7 +24,7 @@ from record import LIVER, RUNS
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.grid import gridded
-from softtwin.meshes.io import read_mesh
+from softtwin.meshes.io import read_volume
 from softtwin.meshes.shapes import beam, propeller
 from softtwin.reference.data.dataset import DataSet, existing
 from softtwin.reference.data.jacobians import missing_jacobians
@@ -68,7 +68,7 @@ class Case:
 def tetrahedral_liver() -> Body:
     """The real liver as it comes, 10,703 linear tetrahedra, held where the sequences hold it."""
     folder = LIVER / "mesh-default"
-    return Body(*read_mesh(folder / "liver.msh"), {"fixed": np.load(folder / "dirichlet-vertices.npy")})
+    return Body(*read_volume(folder / "liver.msh"), {"fixed": np.load(folder / "dirichlet-vertices.npy")})
 
 
 def liver() -> Body:

@@ -109,7 +109,7 @@ def surface_of(name: str) -> Surface:
     """A file's surface, damaged where the name says so after a comma; of a volume mesh its boundary."""
     file, _, damage = name.partition(", ")
     found = read_mesh(SURFACES / file, FILES[file])
-    surface = found if isinstance(found, Surface) else Body(*found, {}).boundary_surface
+    surface = found if isinstance(found, Surface) else Body(found.points, found.cells, {}).boundary_surface
     return DAMAGES[damage](surface) if damage else surface
 
 

@@ -7,7 +7,7 @@ from functools import cached_property, lru_cache
 from itertools import chain
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
@@ -18,6 +18,7 @@ from .quadrature import shape_functions
 _NEWTON_STEPS = 20
 _STEP_TOLERANCE = 1e-13
 _NO_WEIGHT = 1e-9  # a node with less does not move a vertex
+_TOUCHING = 1e-3  # of the body's size: nearer to it a point outside is round-off of the mesh
 _TOLERANCE = 1e-9  # in local coordinates: how far outside a cell a point still counts as inside
 
 
@@ -60,6 +61,16 @@ class Embedding:
         if nodal.shape != (self.node_count, 3):
             raise ValueError(f"displacement: expected shape ({self.node_count}, 3), got {nodal.shape}.")
         return np.einsum("pk,pki->pi", self.weights, nodal[self.nodes])
+
+
+def is_carried_along(body: Body, points: Embedding) -> NDArray[np.bool_]:
+    """Which points lie outside a body, farther than its mesh is from its surface, (p,): where they go is not known.
+
+    Args:
+        body: that carries them.
+        points: carried.
+    """
+    return np.asarray(points.outside > _TOUCHING * body.size)
 
 
 def embed(body: Body, points: ArrayLike) -> Embedding:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from softtwin.meshes.io import TURN, Axes, FileError, Unit
+from softtwin.meshes.io import RAS_TO_LPS, Axes, FileError, Unit
 from softtwin.meshes.io.landmarks import read_named_points
 from softtwin.meshes.io.transforms import read_transform
 
@@ -204,7 +204,7 @@ def read_landmarks(path: str | Path, unit: Unit = "m", axes: Axes | None = None)
         FileError: missing or damaged file, another suffix, no points, or a name twice; the message names it.
     """
     found = read_named_points(path, unit)
-    turn = TURN if axes is not None and found.axes not in (None, axes) else np.ones(3)
+    turn = RAS_TO_LPS if axes is not None and found.axes not in (None, axes) else np.ones(3)
     return {name: turn * place for name, place in found.points.items()}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..body import Floats
-from .common import TURN, Axes, ContentError, FileError, Unit, existing, placed
+from .common import HEAD, RAS_TO_LPS, Axes, ContentError, FileError, Unit, existing, placed
 from .formats.apart import read_apart
 from .formats.ply import read_ply_normals
 from .formats.table import Table, read_table
@@ -32,6 +32,7 @@ _NORMALS = (
 )  # fmt: skip
 _MOST_COLUMNS = 32  # more are the rows of an image, not what is known of a point
 _UNIT = 0.05  # how far the length of a normal may be from 1: three decimals, or bytes
+_MOST_PACKED = 300  # bytes in a byte: what LZF makes of zeros
 _MOST = 0.9  # share of the rows whose columns must be normals to be taken for such
 
 
@@ -100,7 +101,7 @@ def read_points(path: str | Path, unit: Unit = "m", axes: Axes = "lps", normals:
     if not keep.any():
         raise ContentError(f"{path}: expected a cloud with measured points, got {len(points)} rows without one.")
     found = placed(path, points[keep], unit, axes, smallest=0.0)
-    turned = None if facing is None else facing[keep] * (TURN if axes == "ras" else 1.0)
+    turned = None if facing is None else facing[keep] * (RAS_TO_LPS if axes == "ras" else 1.0)
     return Cloud(found, turned, len(points), tuple(said))
 
 
@@ -165,7 +166,7 @@ def _of_array(path: Path, array: NDArray[Any], normals: bool) -> tuple[Floats, F
 def _load(path: Path) -> NDArray[Any]:
     try:
         return np.asarray(np.load(path, allow_pickle=False))
-    except (ValueError, EOFError, OSError, SyntaxError, TypeError, MemoryError) as error:
+    except Exception as error:  # of the tokenizer that reads its header, too
         raise FileError(
             f"{path}: expected rows of three numbers; the file may be truncated or damaged ({error})."
         ) from error
@@ -198,10 +199,25 @@ def _vertex_normals(path: Path) -> Floats | None:
     return None if found is None else np.asarray(found, dtype=np.float64)
 
 
+def _check_pcd(path: Path) -> None:
+    """Refuse a header that names more points than its file can hold: all of them would be made room for."""
+    with path.open("rb") as file:
+        head = file.read(HEAD).split(b"DATA")[0].decode("latin-1")
+    fields = {line.split()[0]: line.split()[1:] for line in head.splitlines() if line.split()}
+    sizes, counts = ([int(word) for word in fields.get(name, ["1"])] for name in ("SIZE", "COUNT"))
+    row = sum(size * count for size, count in zip(sizes, counts, strict=False)) or 1
+    wanted = max(
+        int(fields.get("POINTS", ["0"])[0]), int(np.prod([int(fields.get(n, ["1"])[0]) for n in ("WIDTH", "HEIGHT")]))
+    )
+    if not 0 <= wanted * row <= _MOST_PACKED * path.stat().st_size:
+        raise ValueError(f"{wanted} points of {row} bytes in a file of {path.stat().st_size}")
+
+
 def _read_pcd(path: Path, fields: tuple[str, ...]) -> Floats:
     from pypcd4.pypcd4 import PointCloud  # drags pydantic's models in: only where a PCD comes
 
     try:
+        _check_pcd(path)
         cloud = PointCloud.from_path(path)
         if missing := [name for name in fields if name not in cloud.fields]:
             raise ValueError(f"expected the fields {', '.join(fields)}, and {missing[0]} is missing")

@@ -21,7 +21,7 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 LARGEST, SMALLEST = 1.0, 5e-3  # metres: an organ outside these was read in the wrong unit
 _USUAL = 0.15  # metres: where two units fit, the one in which the organ is nearer to this
 SEGMENTATIONS = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
-TURN = np.array([-1.0, -1.0, 1.0])  # from RAS to LPS and back
+RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])  # from RAS to LPS and back
 HEAD = 2048  # bytes in which a file says what it is
 _SPELLINGS: Mapping[str, tuple[float, Unit]] = {
     **dict.fromkeys(("m", "meter", "metre"), (1.0, "m")),
@@ -146,7 +146,7 @@ def placed(path: Path, points: Floats, unit: Unit, axes: Axes, smallest: float) 
         raise ValueError(f"axes: expected 'lps' or 'ras', got {axes!r}.")
     points = in_metres(points, unit)
     if axes == "ras":
-        points = points * TURN
+        points = points * RAS_TO_LPS
     _warn_size(path, float(np.ptp(points, axis=0).max()), unit, smallest)
     return points
 

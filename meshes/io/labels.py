@@ -31,9 +31,6 @@ _NRRD, _META = (".nrrd", ".nhdr"), (".mha", ".mhd")
 _SLAB = 1 << 24  # voxels read at once: a file of doubles never stands whole in memory
 _MOST_LABEL = 65535
 _MOST_FIELDS = 1000  # of a header
-_UNREADABLE: tuple[type[Exception], ...] = (
-    nibabel.filebasedimages.ImageFileError, nrrd.NRRDError, EOFError, OSError, ValueError, zlib.error,
-)  # fmt: skip
 _TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # from RAS to LPS
 # NRRD names a space by the ends of its axes; each is the first, second or third here.
 _ENDS: Mapping[str, tuple[int, float]] = {
@@ -140,7 +137,7 @@ def _reading(path: Path) -> Iterator[None]:
             yield
     except FileError:
         raise
-    except _UNREADABLE as error:
+    except Exception as error:  # each library has its own, and none names them all
         raise FileError(f"{path}: could not be read; the file may be truncated or damaged ({error}).") from error
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..body import Floats, Ints
 from ..cells import counted, dimension
+from ..elements import KINDS
 from .common import AXES, HEAD, UNITS, Axes, ContentError, FileError, Unit, existing
 from .formats.apart import read_apart
 from .formats.msh import is_first_msh, read_first_msh, read_msh
@@ -70,6 +71,8 @@ def read_raw(path: str | Path) -> RawMesh:
     if (far := float(np.abs(mesh.points).max())) > FARTHEST:
         raise ContentError(f"{path}: expected coordinates of an organ, got {far:.3g}; the file may be damaged.")
     for name, block in mesh.cells.items():
+        if block.shape[1] != _NODES.get(name, block.shape[1]):
+            raise FileError(f"{path}: a {name} has {block.shape[1]} nodes; the file may be damaged.")
         if block.min(initial=0) < 0 or block.max(initial=0) >= len(mesh.points):
             raise FileError(f"{path}: a {name} refers to a point that is not there; the file may be damaged.")
     return mesh
@@ -108,6 +111,13 @@ def _any_msh(path: Path) -> tuple[Floats, dict[str, Ints]]:
     return read_first_msh(path) if is_first_msh(path.read_bytes()[:HEAD]) else read_msh(path)
 
 
+_NODES = {kind.name: kind.nodes for kind in KINDS.values()} | {
+    "vertex": 1,
+    "line": 2,
+    "voxel": 8,
+    "wedge": 6,
+    "pyramid": 5,
+}
 FARTHEST = 1e12  # of any unit: beyond, squares of distances are no numbers of use
 _OWN: Mapping[str, Callable[[Path], tuple[Floats, Any]]] = {
     ".stl": read_stl, ".obj": read_obj, ".msh": _any_msh, ".ply": read_ply,

@@ -46,7 +46,7 @@ def read_transform(path: str | Path, unit: Unit = "m") -> Floats:
             matrix = _laid_out(_content(path, suffix))
     except FileError:
         raise
-    except (ValueError, TypeError, KeyError, IndexError, OSError, EOFError) as error:
+    except Exception as error:  # of the readers of JSON and NPY, too
         raise FileError(f"{path}: expected a matrix of 4 x 4 numbers ({error}).") from error
     matrix[:3, 3] = in_metres(matrix[:3, 3], unit)
     return matrix

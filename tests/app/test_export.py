@@ -10,6 +10,7 @@ import pyvista
 
 from softtwin.app.config import Config, ConfigError
 from softtwin.app.export import FORMATS, Exporter, file_names
+from softtwin.app.record import frame_figures
 from softtwin.app.twin import Twin
 from softtwin.meshes.io import read_surface
 from softtwin.registration.result import Registration
@@ -42,6 +43,23 @@ def test_each_format_holds_the_moved_structures(twin: Twin, result, tmp_path: Pa
             for corner in (np.min, np.max):
                 outer = corner(moved.points[moved.triangles], axis=(0, 1))
                 assert np.abs(corner(back.points, axis=0) - outer).max() < 1e-7  # metres
+
+
+def test_what_lies_outside_the_organ_is_marked_as_not_known(
+    twin: Twin, result: Registration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not twin.outside["tumour"].any()
+    Exporter(twin, tmp_path, ("vtp",)).write(0, result)
+    assert "is_known" not in pyvista.read(tmp_path / "tumour_0000.vtp").point_data
+    assert "outside_share" not in frame_figures(twin, result, None)["targets"]["tumour"]
+    outside = np.arange(len(twin.outside["tumour"])) % 4 == 0
+    monkeypatch.setitem(twin.__dict__, "outside", {"tumour": outside})
+    Exporter(twin, tmp_path, ("vtp",)).write(0, result)
+    assert np.array_equal(pyvista.read(tmp_path / "tumour_0000.vtp").point_data["is_known"], ~outside)
+    target = frame_figures(twin, result, None)["targets"]["tumour"]
+    assert target["outside_share"] == pytest.approx(outside.mean())
+    margins = result.uncertainty.margin(twin.embeddings["tumour"])
+    assert target["margin95_m"] == pytest.approx(margins[~outside].max())
 
 
 def test_the_organ_holds_displacement_and_force(twin: Twin, result, tmp_path: Path) -> None:

@@ -97,7 +97,7 @@ class CommandLines:
         patch.setattr(click.Path, "convert", lambda self, value, param, context: Path(value))  # none of them is here
         patch.setattr("softtwin.app.chain.build_twin", lambda *told: None)  # `build` itself makes the configuration
         patch.setattr("softtwin.app.cli._with_axes", str)  # it reads the surface
-        patch.setattr("softtwin.app.scan.frame_of", lambda path: ("mm", "ras"))  # and the segmentation's header
+        patch.setattr("softtwin.app.scan.frame_of", lambda path: ("mm", "ras", 1e-3))  # and the segmentation's header
         for command in _leaves(softtwin):
             if command.name != "build":
                 patch.setattr(command, "callback", lambda **told: None)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body, Surface
-from softtwin.meshes.embedding import carried, embed
+from softtwin.meshes.embedding import carried, embed, is_carried_along
 from softtwin.meshes.shapes import beam
 
 EPS = np.finfo(float).eps
@@ -119,3 +119,11 @@ def test_curved_cells_are_refused() -> None:
     points[-1] += 1e-3
     with pytest.raises(ValueError, match="expected straight cells"):
         embed(Body(points, straight.cells, dict(straight.node_sets)), points[:3])
+
+
+def test_what_lies_farther_outside_than_the_mesh_is_rough_is_carried_along(tetrahedral_beam: Body) -> None:
+    size = tetrahedral_beam.size
+    middle, end = np.array([0.3, 0.1, 0.1]), np.array([0.6, 0.1, 0.1])
+    points = np.array([middle, end, end])
+    points[1:, 0] += np.array([0.5e-3, 2e-3]) * size
+    assert is_carried_along(tetrahedral_beam, embed(tetrahedral_beam, points)).tolist() == [False, False, True]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import json
 import os
+import re
 import resource
 import select
 import subprocess
@@ -128,10 +129,26 @@ _SERVICE = _Service()
 atexit.register(_SERVICE.end)
 
 
+def _check_counts(path: Path, data: Any) -> None:
+    """Refuse a legacy file of which fewer cells came than it names: its reader says nothing of them."""
+    if path.suffix.lower() != ".vtk" or not data.IsA("vtkUnstructuredGrid"):
+        return
+    text, came = path.read_bytes(), data.GetNumberOfCells()
+    version = re.match(rb"# vtk DataFile Version (\d+)", text)
+    more = 1 if version and int(version.group(1)) >= 5 else 0  # ends of lists: one more than lists
+    for word, beyond in ((rb"CELLS", more), (rb"CELL_TYPES", 0)):
+        for found in re.findall(rb"^%s[ \t]+(\d+)" % word, text, re.MULTILINE):
+            if int(found) != came + beyond:
+                raise FileError(
+                    f"{path}: it names {int(found) - beyond} cells, and {came} can be read; the file may be damaged."
+                )
+
+
 def _answered(path: Path, made: Path) -> dict[str, Any]:
     """What a file holds, written beside; its words in the answer."""
     data = read_vtk(path)
     points, cells = content(path, data)
+    _check_counts(path, data)
     arrays = {"points": points, **{f"cells:{name}": block for name, block in cells.items()}}
     there = data.GetPointData()
     names = [there.GetArrayName(i) for i in range(there.GetNumberOfArrays())]
