@@ -285,7 +285,7 @@ def describe(row: Mapping[str, Any]) -> str:
     force, deviation = np.linalg.norm(row["net_force_N"]), np.linalg.norm(row["net_force_deviation_N"])
     line += f", cloud to surface {millimetres(row['rms_distance_m'])}"
     line += f" without {row['points_left_out']} of {row['points']} points" if row.get("points_left_out") else ""
-    line += f", {row['points_missing']} rows of zeros passed over" if "points_missing" in row else ""
+    line += f", {row['points_missing']} rows without a measurement passed over" if "points_missing" in row else ""
     if "shared_noise" in row:
         size, length = (row["shared_noise"][name] for name in ("size_m", "length_m"))
         line += f", of which neighbours within {millimetres(length, 0)} share noise of {millimetres(size)}"

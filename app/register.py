@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from tqdm import tqdm
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.io import Axes, ContentError, FileError, Unit, is_companion, read_cloud
+from softtwin.meshes.io import Axes, ContentError, FileError, Unit, is_companion, read_points
 from softtwin.meshes.io.clouds import TABLES
 from softtwin.registration.pose import Pose, read_matrix
 from softtwin.registration.priors import PosePrior
@@ -60,7 +60,17 @@ class CloudFile:
         Raises:
             FileError: the file is missing, damaged, or of no known kind.
         """
-        return read_cloud(self.path, self.coordinates.unit, self.coordinates.axes, self.normals)
+        return self.measured()[0]
+
+    def measured(self) -> tuple[Floats, int]:
+        """The same, and how many rows of the file have no measurement and were left out.
+
+        Raises:
+            FileError: as `read`.
+        """
+        found = read_points(self.path, self.coordinates.unit, self.coordinates.axes, self.normals)
+        points = found.points if found.normals is None else np.hstack([found.points, found.normals])
+        return points, found.rows - len(found.points)
 
 
 def find_clouds(names: Sequence[Path | str], coordinates: Coordinates, normals: bool = False) -> list[CloudFile]:
@@ -436,8 +446,9 @@ def registered(
     if not isinstance(cloud, CloudFile):
         return sequence.register(cloud, until)
     try:
-        points = cloud.read()
+        points, missing = cloud.measured()
         landmarks = None if frame_landmarks is None else frame_landmarks.of(cloud.path)
     except FileError as error:  # it could be read a moment ago, or holds nothing to register
         return sequence.refuse(str(error).removeprefix(f"{cloud.path}: "))  # the frame says which file it is
-    return sequence.register(points, until, landmarks)
+    frame = sequence.register(points, until, landmarks)
+    return replace(frame, missing=frame.missing + missing)

@@ -80,7 +80,7 @@ class Frame:
         seconds: wall time, that of a search for the pose included.
         cloud: points that were used, after thinning, (p, 3), metres; None as above.
         landmarks: how many pulled beside the cloud.
-        missing: rows of the cloud that were passed over: zeros, where a depth camera has measured nothing.
+        missing: rows of the cloud that were passed over: zeros or NaN, where a camera has measured nothing.
     """
 
     number: int

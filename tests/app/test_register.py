@@ -194,6 +194,17 @@ def test_a_camera_that_is_seen_to_stand_elsewhere_is_said(plain_twin: Twin, clou
         assert 0.2 * off < row["pose_correction"]["translation_m"] < 2.0 * off
 
 
+def test_pixels_without_a_measurement_in_a_file_are_counted(plain_twin: Twin, cloud, tmp_path: Path) -> None:
+    for name, hole in (("zeros", 0.0), ("nan", np.nan)):
+        image = np.full((30, 20, 3), hole)
+        image.reshape(-1, 3)[np.sort(np.random.default_rng(0).permutation(600)[:400])] = cloud
+        np.save(tmp_path / f"{name}.npy", image)
+    np.save(tmp_path / "whole.npy", cloud)
+    rows = register_clouds(plain_twin, find_clouds([tmp_path], METRES), tmp_path / "out", say=lambda line: None)
+    assert [row.get("points_missing", 0) for row in rows] == [200, 0, 200]
+    assert [row["points"] for row in rows] == [400] * 3
+
+
 def test_rows_of_zeros_are_passed_over_and_counted_apart(plain_twin: Twin, cloud, forces, tmp_path: Path) -> None:
     """A depth camera's missing pixels: the frame is the same with them and without, in every figure and file."""
     moved = plain_twin.body.points + plain_twin.predict(forces).displacement
@@ -214,7 +225,7 @@ def test_rows_of_zeros_are_passed_over_and_counted_apart(plain_twin: Twin, cloud
     assert row["margins_in"] == "body"
     target = row["targets"]["tumour"]
     assert target["error_m"] < target["margin95_m"] and target["camera_margin95_m"] < target["margin95_m"]
-    assert "3000 rows of zeros passed over" in lines[1] and "in the camera's coordinates)" in lines[1]
+    assert "3000 rows without a measurement passed over" in lines[1] and "in the camera's coordinates)" in lines[1]
     assert pv.read(tmp_path / "holed" / "cloud_0000.vtp").n_points == 400
 
 
