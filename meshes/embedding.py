@@ -13,12 +13,13 @@ from scipy.spatial import cKDTree
 
 from .body import Body, Floats, Ints, Surface
 from .elements import linear_kind, split_facets
+from .metrics import edge_lengths
 from .quadrature import shape_functions
 
 _NEWTON_STEPS = 20
 _STEP_TOLERANCE = 1e-13
 _NO_WEIGHT = 1e-9  # a node with less does not move a vertex
-_TOUCHING = 1e-3  # of the body's size: nearer to it a point outside is round-off of the mesh
+_ROUGH, _ROUGH_OF_EDGE = 3e-3, 0.1  # of the body's size and of its median edge: so far a mesh is from its surface
 _TOLERANCE = 1e-9  # in local coordinates: how far outside a cell a point still counts as inside
 
 
@@ -66,11 +67,15 @@ class Embedding:
 def is_carried_along(body: Body, points: Embedding) -> NDArray[np.bool_]:
     """Which points lie outside a body, farther than its mesh is from its surface, (p,): where they go is not known.
 
+    A mesh lies within 3 thousandths of the body's size, or a tenth of its edges, of the surface that it was made of
+    (`solidify`).
+
     Args:
         body: that carries them.
         points: carried.
     """
-    return np.asarray(points.outside > _TOUCHING * body.size)
+    edge = float(np.median(edge_lengths(body.points, body.corner_cells)))
+    return np.asarray(points.outside > max(_ROUGH * body.size, _ROUGH_OF_EDGE * edge))
 
 
 def embed(body: Body, points: ArrayLike) -> Embedding:

@@ -122,8 +122,7 @@ def test_curved_cells_are_refused() -> None:
 
 
 def test_what_lies_farther_outside_than_the_mesh_is_rough_is_carried_along(tetrahedral_beam: Body) -> None:
-    size = tetrahedral_beam.size
     middle, end = np.array([0.3, 0.1, 0.1]), np.array([0.6, 0.1, 0.1])
     points = np.array([middle, end, end])
-    points[1:, 0] += np.array([0.5e-3, 2e-3]) * size
+    points[1:, 0] += [0.005, 0.03]  # of edges of 0.1 m
     assert is_carried_along(tetrahedral_beam, embed(tetrahedral_beam, points)).tolist() == [False, False, True]
