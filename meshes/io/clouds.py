@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..body import Floats
-from .common import HEAD, RAS_TO_LPS, Axes, ContentError, FileError, Unit, existing, placed
+from .common import HEAD, LARGEST, RAS_TO_LPS, Axes, ContentError, FileError, Unit, existing, placed
 from .formats.apart import read_apart
 from .formats.ply import read_ply_normals
 from .formats.table import Table, read_table
@@ -32,6 +32,7 @@ _NORMALS = (
 )  # fmt: skip
 _MOST_COLUMNS = 32  # more are the rows of an image, not what is known of a point
 _UNIT = 0.05  # how far the length of a normal may be from 1: three decimals, or bytes
+_SCENE = 2 * LARGEST  # metres: what a camera sees around an organ; a part of it may be as small as it likes
 _MOST_PACKED = 300  # bytes in a byte: what LZF makes of zeros
 _MOST = 0.9  # share of the rows whose columns must be normals to be taken for such
 
@@ -100,7 +101,7 @@ def read_points(path: str | Path, unit: Unit = "m", axes: Axes = "lps", normals:
         keep &= ~zeros
     if not keep.any():
         raise ContentError(f"{path}: expected a cloud with measured points, got {len(points)} rows without one.")
-    found = placed(path, points[keep], unit, axes, smallest=0.0)
+    found = placed(path, points[keep], unit, axes, smallest=0.0, largest=_SCENE)
     turned = None if facing is None else facing[keep] * (RAS_TO_LPS if axes == "ras" else 1.0)
     return Cloud(found, turned, len(points), tuple(said))
 

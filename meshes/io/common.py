@@ -130,7 +130,9 @@ def existing(path: str | Path) -> Path:
     return path
 
 
-def placed(path: Path, points: Floats, unit: Unit, axes: Axes, smallest: float) -> Floats:
+def placed(
+    path: Path, points: Floats, unit: Unit, axes: Axes, smallest: float = SMALLEST, largest: float = LARGEST
+) -> Floats:
     """Points of a file in metres and LPS; warns of a size that fits no organ.
 
     Args:
@@ -139,6 +141,7 @@ def placed(path: Path, points: Floats, unit: Unit, axes: Axes, smallest: float) 
         unit: the file's unit of length.
         axes: the file's axes.
         smallest: below this size it warns, metres.
+        largest: above this size it warns, metres.
     """
     if unit not in METRES:
         raise ValueError(f"unit: expected 'm', 'cm' or 'mm', got {unit!r}.")
@@ -147,13 +150,13 @@ def placed(path: Path, points: Floats, unit: Unit, axes: Axes, smallest: float) 
     points = in_metres(points, unit)
     if axes == "ras":
         points = points * RAS_TO_LPS
-    _warn_size(path, float(np.ptp(points, axis=0).max()), unit, smallest)
+    size = float(np.ptp(points, axis=0).max())
+    if np.isfinite(size) and not smallest <= size <= largest:
+        _warn_size(path, size, unit)
     return points
 
 
-def _warn_size(path: Path, size: float, unit: Unit, smallest: float) -> None:
-    if smallest <= size <= LARGEST or not np.isfinite(size):
-        return
+def _warn_size(path: Path, size: float, unit: Unit) -> None:
     warnings.warn(
         f"{path} is {size:.3g} m across when read in {unit}, outside the {SMALLEST * 1e3:g} mm to {LARGEST:g} m of "
         f"an organ; {unit_advice(size, unit)}.",

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..body import Surface
 from ..cells import dimension
-from .common import SMALLEST, Axes, FileError, Unit, placed
+from .common import Axes, FileError, Unit, placed
 from .raw import RawMesh, known, read_raw
 
 
@@ -48,5 +48,5 @@ def as_surface(path: Path, mesh: RawMesh, unit: Unit, axes: Axes) -> Surface:
         # An STL repeats every vertex in each of its triangles, and so do some programs in any format.
         points, triangles = places, numbers.ravel()[triangles]
     used, numbers = np.unique(triangles, return_inverse=True)
-    points = placed(path, points[used], unit, axes, smallest=SMALLEST)
+    points = placed(path, points[used], unit, axes)
     return Surface(points, numbers.reshape(-1, 3).astype(np.int64))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..body import Floats, Ints, Surface
 from ..cells import CellError, one_kind
-from .common import SMALLEST, Axes, FileError, Unit, placed
+from .common import Axes, FileError, Unit, placed
 from .raw import RawMesh, known, read_raw
 from .surfaces import as_surface
 
@@ -82,5 +82,5 @@ def _volume(path: Path, mesh: RawMesh, unit: Unit, axes: Axes) -> Volume:
     numbers, local = np.unique(cells, return_inverse=True)
     if left := len(mesh.points) - len(numbers):
         said.append(f"nodes: {left} of {len(mesh.points)} belong to no volume cell and were left out")
-    points = placed(path, mesh.points[numbers], unit, axes, smallest=SMALLEST)
+    points = placed(path, mesh.points[numbers], unit, axes)
     return Volume(points, local.reshape(cells.shape).astype(np.int64), numbers, tuple(said))
