@@ -493,7 +493,11 @@ def _source(source: str, unit: Unit | None, frame: Axes | None) -> tuple[str, Un
         from .scan import framed
 
         return framed(source, unit, frame)
-    return _with_axes(_resolved(source)), unit or _stated_unit(source) or "m", frame or ""
+    stated = _stated_unit(source)
+    file = parse_file(_with_axes(_resolved(source)))
+    if unit and stated and unit != stated and file.unit is None:
+        file = replace(file, unit=unit)  # what the user says wins, and the configuration holds that it was said
+    return str(file), file.unit or unit or stated or "m", frame or ""
 
 
 def _with_axes(source: str) -> str:

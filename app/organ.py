@@ -117,7 +117,7 @@ def make_organ(section: BodySection, root: Path) -> Organ:
         reader = _Reader(root, section.unit, files_axes(section), scan)
         solid, notes = _solid(section, reader, source)
         body, reader = Body(solid.points, solid.cells, {}), replace(reader, numbers=solid.numbers)
-        notes += [f"axes: {reader.axes.upper()}, inside LPS" if reader.axes else "axes: none said, nothing turned"]
+        notes += [*_overruled(section, root), *_axes_said(reader)]
     for name, text in section.inner.items():
         surface, said = _inner(name, text, reader)
         notes += [*said, *_outside(body, name, surface)]
@@ -135,6 +135,19 @@ def make_organ(section: BodySection, root: Path) -> Organ:
         body, line = _on_grid(body, section.grid)
         notes.append(line)
     return Organ(body, tuple(notes))
+
+
+def _axes_said(reader: _Reader) -> list[str]:
+    return [f"axes: {reader.axes.upper()}, inside LPS" if reader.axes else "axes: none said, nothing turned"]
+
+
+def _overruled(section: BodySection, root: Path) -> list[str]:
+    """A warning where a mesh file states another unit than the one that stands behind its name."""
+    source = parse_file(section.source)
+    path = root / source.path
+    if source.unit is None or is_segmentation(path) or (stated := stated_unit(path)) in (None, source.unit):
+        return []
+    return [f"warning: {path} states that it is in {stated}; {source.unit} was taken, as you say"]
 
 
 def _on_grid(body: Body, edge: float) -> tuple[Body, str]:

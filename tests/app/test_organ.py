@@ -14,12 +14,12 @@ pytest.importorskip("pytetwild", reason="the extra mesh is absent")
 
 from softtwin.app import organ as module
 from softtwin.app.cli import _stated_unit, _with_axes, main
-from softtwin.app.config import BodySection, ConfigError, files_axes, parse_config
+from softtwin.app.config import BodySection, Config, ConfigError, files_axes, parse_config
 from softtwin.app.organ import make_organ
 from softtwin.meshes.attachment import RegionError
 from softtwin.meshes.body import Body, BodyError, Surface
 from softtwin.meshes.export import Coordinates, write_surface
-from softtwin.meshes.io import FileError, UnitWarning
+from softtwin.meshes.io import FileError, UnitWarning, read_surface
 from softtwin.meshes.shapes import beam, liver_phantom
 
 PHANTOM_SIZE = 0.016
@@ -188,6 +188,22 @@ def test_a_unit_that_a_file_states_is_taken_and_none_against_it(
     )
     made = make(files, source=str(files / "organ.vtu"), frame="lps", inner={"tumour": str(inner)})
     assert np.abs(made.inner["tumour"].points.mean(0) - phantom.inner["tumour"].points.mean(0)).max() < 1e-3
+
+
+def test_a_unit_that_is_said_wins_over_the_one_that_a_mesh_states(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball = read_surface(files / "organ.stl", "mm")
+    write_surface(tmp_path / "organ.ply", Surface(1e3 * ball.points, ball.triangles), place=Coordinates("m", "lps"))
+    seen: list[Config] = []
+    monkeypatch.setattr("softtwin.app.chain.build_twin", lambda config, *_: seen.append(config))
+    for words, unit in ((["--unit", "mm"], "mm"), ([], "m")):
+        main(["build", str(tmp_path / "organ.ply"), *words, "--fixed", "ball:0,0,0:1"])
+        assert seen[-1].body.unit == unit
+    assert seen[0].body.source == f"{tmp_path / 'organ.ply'}:mm:lps"
+    body = {"source": seen[0].body.source, "unit": "mm", "nodes": 300, "fixed": "halfspace:0,0,0:0,0,-1"}
+    notes = make_organ(parse_config({"body": body}).body, tmp_path).notes
+    assert f"warning: {tmp_path / 'organ.ply'} states that it is in m; mm was taken, as you say" in notes
 
 
 def test_an_inner_surface_outside_the_organ_is_refused_and_a_part_outside_is_said(files: Path, tmp_path: Path) -> None:
