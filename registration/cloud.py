@@ -35,8 +35,8 @@ class Cloud:
     def of(cls, cloud: ArrayLike) -> Cloud:
         """The cloud in an array; what is no cloud is left for `check_cloud` to refuse.
 
-        Depth cameras write zeros for pixels without a measurement. Of measured numbers no two are the origin to the
-        last bit: rows of zeros that come more than once are none, and one alone is taken as it is.
+        Depth cameras write NaN or zeros for pixels without a measurement. Of measured numbers no two are the origin to
+        the last bit: rows of zeros that come more than once are none, and one alone is taken as it is.
 
         Args:
             cloud: points, (p, 3), metres; with normals behind their coordinates (p, 6), NaN where none was measured.
@@ -48,8 +48,10 @@ class Cloud:
         if table.ndim != 2 or table.shape[1] not in (_POINTS, _ORIENTED) or not len(table):
             return cls(table)
         is_zero = ~table[:, :3].any(axis=1)
-        missing = int(is_zero.sum()) if is_zero.sum() > 1 else 0
-        table = table[~is_zero] if missing else table
+        gone = ~np.isfinite(table[:, :3]).all(axis=1) | (is_zero if is_zero.sum() > 1 else False)
+        if np.isnan(table[:, :3]).all():
+            return cls(table[:, :3])  # nothing was measured: that is for `check_cloud`, too
+        missing, table = int(gone.sum()), table[~gone]
         if table.shape[1] == _POINTS or not len(table):
             return cls(table[:, :3], None, missing)
         points, normals = np.ascontiguousarray(table[:, :3]), table[:, 3:].copy()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkPoints, vtkStringArray, vtkStringOutputWindow
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkGenericCell, vtkUnstructuredGrid
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkCellTypes, vtkGenericCell, vtkUnstructuredGrid
 from vtkmodules.vtkIOLegacy import vtkDataSetReader
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
 
@@ -23,6 +23,7 @@ from .polygons import by_length, stripped, triangulated
 READERS: Mapping[str, Any] = {
     ".vtk": vtkDataSetReader, ".vtu": vtkXMLUnstructuredGridReader, ".vtp": vtkXMLPolyDataReader,
 }  # fmt: skip
+_NO_CELLS = ("UnknownClass", "vtkEmptyCell")
 _ANY_SIZE = ("vertex group", "line string", "polyhedron")
 _NAMES = {kind.vtk: kind.name for kind in KINDS.values()} | {
     **{1: "vertex", 2: "vertex group", 3: "line", 4: "line string", 21: "line3"},
@@ -129,6 +130,10 @@ def grid_blocks(path: Path, grid: Any) -> dict[str, Ints]:
     for kind in np.unique(types):
         chosen = np.flatnonzero(types == kind)
         name, few, many = _NAMES.get(int(kind), ""), sizes[chosen].min(), sizes[chosen].max()
+        if not name and vtkCellTypes.GetClassNameFromTypeId(int(kind)) in _NO_CELLS:
+            raise FileError(
+                f"{path}: {len(chosen)} cells are of no kind that VTK knows ({kind}); the file may be damaged."
+            )
         if not name:
             cell = vtkGenericCell()
             cell.SetCellType(int(kind))
