@@ -38,7 +38,6 @@ UNCOUNTED = (
     ".fcsv",
     ".obj",
 )  # a line less is a file as whole as before
-BESIDE = (".raw", ".raw.gz", ".zraw", ".gz")
 
 
 def mutated(content: bytes, way: str, rng: np.random.Generator) -> bytes:

@@ -24,7 +24,7 @@ _MARGIN = 3  # voxels around what is filled
 _FINEST = 160  # cells along the longest side: voxels finer than this are taken together
 _ITERATIONS, _PASS_BAND = 20, 0.02
 _FITS = 3
-_LID = 4.0  # radii of a structure: with 1, 2 and 8 the tumour below is found within by 12, 36 and 48 %
+_LID = 4.0  # radii of a structure; larger balls find no more of it within (tests/app/test_cases.py), and bridge more
 _CRUMB = 8  # voxels: smaller components are no structure
 
 

@@ -74,7 +74,7 @@ def read_named_points(path: str | Path, unit: Unit = "m") -> Landmarks:
 _Named = list[tuple[str, Sequence[Any]]]
 
 
-def _rows(path: Path, skip: str = "") -> list[list[str]]:
+def _rows(path: Path) -> list[list[str]]:
     """Fields of each line that is no comment, without blanks and quotes around them."""
     lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip() and line[0] != "#"]
     first = lines[0] if lines else ""

@@ -89,7 +89,9 @@ def test_parts_of_structures_that_leave_the_organ() -> None:
     joined, notes = organ_surface(segmentation, "1", inner=["3"], join=["2"])
     assert 1e6 * joined.volume == pytest.approx(expect["joined_volume_ml"], rel=0.003)
     assert any(note.startswith("segmentation: 3 lies inside by 7") for note in notes)  # 79 %, and a lid that is flat
-    outline, _ = organ_surface(segmentation, "1", inner=["2", "3"])
+    outline, notes = organ_surface(segmentation, "1", inner=["2", "3"])
+    assert any(note.startswith("segmentation: 2 lies inside by 48 %") for note in notes)  # a flat lid: 60 are right
+    assert any(note.startswith("segmentation: 3 lies inside by 77 %") for note in notes)  # 79 are right
     assert 1e6 * outline.volume == pytest.approx(expect["outline_ml"], rel=0.006)
     every, _ = organ_surface(segmentation, "1", join=["2", "3"])
     assert 1e6 * every.volume == pytest.approx(expect["all_labels_ml"], rel=0.002)
@@ -158,3 +160,14 @@ def test_landmarks(row: dict[str, Any]) -> None:
 def test_a_transform(row: dict[str, Any]) -> None:
     found, same = (read_matrix(CASES / name) for name in (row["file"], row["expect"]["same_as"]))
     assert found.matrix == pytest.approx(same.matrix, abs=1e-9)
+
+
+def test_larger_balls_find_no_more_of_a_structure_within(monkeypatch: pytest.MonkeyPatch) -> None:
+    segmentation = read_segmentation(CASES / "tumour_surface" / "seg.nii.gz")
+    shares = {}
+    for radii in (1.0, 2.0, 4.0, 8.0):
+        monkeypatch.setattr("softtwin.meshes.voxels._LID", radii)
+        notes = organ_surface(segmentation, "1", inner=["2", "3"])[1]
+        shares[radii] = [any(f"segmentation: {label} lies inside by {share} %" in note for note in notes)
+                         for label, share in (("2", 48), ("3", 77))]  # fmt: skip
+    assert shares[4.0] == shares[8.0] == [True, True] and not shares[1.0][0] and not shares[2.0][0]

@@ -1,7 +1,7 @@
 """VTK's files of other programs, read by VTK in a process of its own: a damaged file ends that one, and is an error.
 
-VTK's readers trust what a file says of itself. Of 392 files with some bytes changed 14 ended the process
-(benchmarks/damaged_files.py). The process is begun with the first file and serves all that come after it.
+VTK's readers trust what a file says of itself, and a few changed bytes can end their process:
+benchmarks/damaged_files.py has such files. The process is begun with the first file and serves all that come after it.
 """
 
 from __future__ import annotations
