@@ -378,7 +378,7 @@ def _component(segmentation: Segmentation, voxels: Voxels, component: str) -> tu
         return np.asarray(minimum(distance, label(both.filled)[0], range(1, count + 1)), dtype=np.float64)
 
     try:
-        number = chosen_component(component, counts.astype(np.float64), middles, away, str(segmentation.path))
+        number = chosen_component(component, counts.astype(np.float64), middles, away)
     except ComponentError as error:
         raise ComponentError(f"{segmentation.path}: {error}") from None
     one = abs(float(np.linalg.det(voxels.to_lps[:3, :3])))
