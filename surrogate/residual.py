@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
@@ -109,21 +110,49 @@ class ElasticBody(nn.Module):
         with torch.enable_grad():
             at = F if is_differentiated else F.requires_grad_()
             (stress,) = torch.autograd.grad(self.density(at).sum(), at, create_graph=is_differentiated)
+        return self.gathered(stress)
+
+    def energy_and_forces(self, displacement: Tensor) -> tuple[Tensor, Tensor]:
+        """Strain energy, (s,), joules, and its derivative, (s, n, 3), newtons, of states that carry no derivatives.
+
+        Where a cell is inside out, the energy is infinite.
+        """
+        F = self.deformation_gradients(displacement).detach()
+        with torch.enable_grad():
+            at = F.requires_grad_()
+            density = self.density(at)
+            (stress,) = torch.autograd.grad(density.sum(), at)
+        density = density.detach()
+        is_sound = (TorchAlgebra(F).det(F.detach()) > 0.0) | self.material.is_linear
+        energy = torch.where(is_sound, density * self.volumes, torch.inf).sum(dim=(1, 2))
+        return energy, self.gathered(stress)
+
+    def gathered(self, stress: Tensor) -> Tensor:
+        """Nodal forces, (s, n, 3), newtons, of stresses P at the points of the quadrature, (s, cells, q, 3, 3)."""
         shares = torch.einsum("scqij,cqkj,cq->scki", stress, self.gradients, self.volumes)
-        forces = torch.zeros(len(F), self.nodes, 3, dtype=F.dtype, device=F.device)
-        return forces.index_add(1, self.cells.reshape(-1), shares.reshape(len(F), -1, 3))
+        forces = torch.zeros(len(stress), self.nodes, 3, dtype=stress.dtype, device=stress.device)
+        return forces.index_add(1, self.cells.reshape(-1), shares.reshape(len(stress), -1, 3))
 
     def cell_stiffnesses(self, displacement: Tensor) -> Tensor:
-        """Tangents of the cells at one state, (n, 3), metres: (cells, 3k, 3k), N/m, node by node."""
-        F = self.deformation_gradients(displacement[None])[0]
-        stress = torch.func.grad(lambda at: self.density(at).sum())
-        ways = torch.eye(9, dtype=F.dtype, device=F.device).reshape(9, 3, 3)
-        slopes = [torch.func.jvp(stress, (F,), (way.expand_as(F),))[1] for way in ways]
-        moduli = torch.stack(slopes, dim=-1).unflatten(-1, (3, 3)) * self.volumes[..., None, None, None, None]
+        """Tangents of the cells, node by node, N/m: (cells, 3k, 3k) at one state, (n, 3), metres; (s, ...) at many."""
+        if displacement.ndim == 2:
+            return self.cell_stiffnesses(displacement[None])[0]
+        F = self.deformation_gradients(displacement)
+        moduli = self.moduli(F) * self.volumes[..., None, None, None, None]
         cells, _, nodes, _ = self.gradients.shape
-        ahead = torch.einsum("cqijml,cqnl->cqjinm", moduli, self.gradients).reshape(cells, -1, 9 * nodes)
+        ahead = torch.einsum("scqijml,cqnl->scqjinm", moduli, self.gradients).reshape(len(F), cells, -1, 9 * nodes)
         behind = self.gradients.transpose(1, 2).reshape(cells, nodes, -1)
-        return (behind @ ahead).reshape(cells, 3 * nodes, 3 * nodes)
+        return (behind @ ahead).reshape(len(F), cells, 3 * nodes, 3 * nodes)
+
+    def moduli(self, F: Tensor) -> Tensor:
+        """Second derivatives of the energy density by F, pascals: (..., 3, 3, 3, 3) for (..., 3, 3)."""
+        stress = torch.func.grad(lambda at: self.density(at).sum())
+
+        def component(i: int, j: int) -> Callable[[Tensor], Tensor]:
+            return lambda at: stress(at)[..., i, j].sum()
+
+        rows = [torch.func.grad(component(i, j))(F) for i in range(3) for j in range(3)]
+        return torch.stack(rows, dim=-3).unflatten(-3, (3, 3))
 
     def stiffness(self, displacement: Tensor) -> csr_matrix:
         """The tangent at one state, (n, 3), metres: (3n, 3n), N/m, fixed nodes included, no following pressure."""

@@ -1,0 +1,303 @@
+"""Hyperelastic equilibria in torch: many loads of one body at a time, on a processor or a GPU, without FEniCSx.
+
+Each state is a minimum of its potential energy. Newton's method finds it with a line search on that energy, from the
+warped linear response; the tangents of all states are factored together, layer by layer (Odot 2023, chapter 7, calls a
+solver in torch DiffEn).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from softtwin.meshes.body import Body
+from softtwin.reference.data.materials import Material
+
+from .residual import ElasticBody
+from .tangents import Factors, LayeredMatrices, layers_of
+from .warping import Warping
+
+_DESCENT = 1e-4  # of what the slope promises (Nocedal and Wright, Numerical Optimization, section 3.1)
+_SHORTEST = 1e-8
+_SHARES = (1.0, 0.5, 0.25)  # of the load whose warped response is tried as a start
+_SHIFTS = tuple(0.01 * 4.0**i for i in range(10))  # of the stiffness at no load, added where a tangent is indefinite
+_TYPES = {"double": "float64", "single": "float32"}
+_EPSILONS = 8.0  # of machine precision in sums of energies that cancel: changes below them are none
+
+
+@dataclass(frozen=True)
+class NewtonSettings:
+    """When a state is found, and how long it is looked for.
+
+    Args:
+        tolerance: out-of-balance forces relative to the load's, in the norm of all free components.
+        iterations: of Newton's method, for one part of a load.
+        load_steps: parts into which a load is cut, at most, where it is not found at once.
+        chunk: states that are solved together, at most; None as many as the device's memory holds.
+
+    Raises:
+        ValueError: an argument out of its range.
+    """
+
+    tolerance: float = 1e-10
+    iterations: int = 60
+    load_steps: int = 16
+    chunk: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.tolerance < 1.0:
+            raise ValueError(f"NewtonSettings.tolerance: expected a number between 0 and 1, got {self.tolerance}.")
+        for name in ("iterations", "load_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"NewtonSettings.{name}: expected at least 1, got {getattr(self, name)}.")
+        if self.chunk is not None and self.chunk < 1:
+            raise ValueError(f"NewtonSettings.chunk: expected at least 1, got {self.chunk}.")
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """What was found for s loads.
+
+    Args:
+        displacement: (s, n, 3), metres; what is not converged is where the search ended.
+        residual: out-of-balance forces relative to the load's, (s,).
+        is_converged: (s,).
+        iterations: of Newton's method, all load steps together, (s,).
+        load_steps: parts of the load that were solved one after another, (s,).
+        is_stable: the tangent there is positive definite, (s,).
+    """
+
+    displacement: Tensor
+    residual: Tensor
+    is_converged: Tensor
+    iterations: Tensor
+    load_steps: Tensor
+    is_stable: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """States of a search, and what holds there."""
+
+    displacement: Tensor  # (s, n, 3)
+    energy: Tensor  # (s,), potential energy
+    residual: Tensor  # (s, u), out-of-balance forces
+
+    def __getitem__(self, chosen: Tensor) -> _Search:
+        return _Search(self.displacement[chosen], self.energy[chosen], self.residual[chosen])
+
+    def put(self, chosen: Tensor, other: _Search) -> None:
+        self.displacement[chosen], self.energy[chosen] = other.displacement, other.energy
+        self.residual[chosen] = other.residual
+
+
+class Equilibria:
+    """Equilibria of a body under dead nodal forces, in batches.
+
+    Args:
+        body: the body, in space.
+        material: a compressible law of this package.
+        device: `cpu`, `cuda`, or a torch device.
+        precision: `double`, or `single` where a tolerance of about 1e-5 is enough.
+        settings: of Newton's method.
+
+    Raises:
+        ValueError: a material or a body that `ElasticBody` does not know, a body that nothing holds, or one too large
+            for the device.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        material: Material,
+        device: str | torch.device = "cpu",
+        precision: str = "double",
+        settings: NewtonSettings | None = None,
+    ) -> None:
+        if precision not in ("double", "single"):
+            raise ValueError(f"Equilibria.precision: expected 'double' or 'single', got {precision!r}.")
+        self.elastic = ElasticBody(body, material).to(device, getattr(torch, _TYPES[precision]))
+        self.dtype, self.device = self.elastic.gradients.dtype, self.elastic.gradients.device
+        self.body, self.material, self.settings = body, material, settings or NewtonSettings()
+        is_free = self.elastic.free[:, 0].cpu().numpy() > 0.0
+        layers = layers_of(body.cells.astype(np.int64), is_free)
+        free = np.flatnonzero(is_free)
+        numbers = np.full((len(is_free), 3), 3 * len(free))
+        numbers[free] = np.arange(3 * len(free)).reshape(-1, 3)
+        self._free = torch.from_numpy(free).to(self.device)
+        of_cells = torch.from_numpy(numbers).to(self.device)[self.elastic.cells].flatten(1)
+        self._matrices = LayeredMatrices(of_cells, np.repeat(layers[free], 3))
+        self._warping = None if material.is_linear else Warping(self.elastic, layers)
+        self._rest = self._matrices.assembled(self.elastic.cell_stiffnesses(self._field(1)))
+        self._at_rest = self._matrices.factor(self._rest)
+        # F is 1 + grad u: an energy density is rounded as its terms are, which are as large as the moduli.
+        unit = torch.eye(3, dtype=self.dtype, device=self.device).expand(*self.elastic.volumes.shape, 3, 3)
+        self._epsilon = torch.finfo(self.dtype).eps
+        stiffest = self.elastic.moduli(unit).amax(dim=(2, 3, 4, 5))
+        self._noise = _EPSILONS * self._epsilon * float((stiffest * self.elastic.volumes).sum())
+        if not bool(self._at_rest.is_positive.all()):
+            raise ValueError(
+                "Equilibria.body: expected a body that something holds; its stiffness at no load has directions that "
+                "cost no energy."
+            )
+
+    def _field(self, count: int) -> Tensor:
+        return torch.zeros(count, self.elastic.nodes, 3, dtype=self.dtype, device=self.device)
+
+    def _picked(self, field: Tensor) -> Tensor:
+        """Free components of a nodal field, (s, n, 3): (s, u)."""
+        return field[:, self._free].flatten(1)
+
+    def _spread(self, values: Tensor) -> Tensor:
+        """The field that is zero where nodes are held, (s, n, 3)."""
+        return self._field(len(values)).index_copy(1, self._free, values.reshape(len(values), -1, 3))
+
+    def solve(self, forces: Tensor, start: Tensor | None = None) -> States:
+        """States under loads; each in one step where that succeeds, else in 2, 4, ... parts of the load.
+
+        Args:
+            forces: nodal forces, (s, n, 3), newtons; those at held nodes do nothing.
+            start: displacements to begin at, (s, n, 3), metres; none if not given.
+
+        Raises:
+            ValueError: another shape, or numbers that are not finite.
+        """
+        loads = self._picked(self._checked("forces", forces))
+        begin = None
+        if start is not None:
+            begin = self._spread(self._picked(self._checked("start", start)))
+        size = self.settings.chunk or self._chunk()
+        parts = [
+            self._solved(loads[i : i + size], None if begin is None else begin[i : i + size])
+            for i in range(0, max(len(loads), 1), size)
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        return States(*(torch.cat([getattr(part, item.name) for part in parts]) for item in fields(States)))
+
+    def _checked(self, name: str, field: Tensor) -> Tensor:
+        field = field.to(self.device, self.dtype)
+        if field.ndim != 3 or field.shape[1:] != (self.elastic.nodes, 3):
+            raise ValueError(
+                f"Equilibria.{name}: expected shape (s, {self.elastic.nodes}, 3), got {tuple(field.shape)}."
+            )
+        if not bool(torch.isfinite(field).all()):
+            raise ValueError(f"Equilibria.{name}: expected finite numbers, got NaN or infinity.")
+        return field
+
+    def _chunk(self) -> int:
+        """States whose tangents fit into a quarter of what is free on a GPU; on a processor what its caches like."""
+        cells, points = self.elastic.volumes.shape
+        width = 3 * self.elastic.cells.shape[1]
+        state = (cells * (2 * width * width + 300 * points) + 4 * self._matrices.entries) * self._rest.element_size()
+        free = torch.cuda.mem_get_info(self.device)[0] // 4 if self.device.type == "cuda" else 2**28
+        return max(1, int(free // state))
+
+    def _solved(self, loads: Tensor, begin: Tensor | None) -> States:
+        start = self._starts(loads) if begin is None else begin
+        found = self._newton(loads, start)
+        origin = torch.zeros_like(start) if begin is None else begin
+        steps, parts = torch.ones_like(found.iterations), 2
+        while parts <= self.settings.load_steps and not bool(found.is_converged.all()):
+            missing = torch.nonzero(~found.is_converged)[:, 0]
+            now = origin[missing]
+            count = torch.zeros_like(missing)
+            for part in range(1, parts + 1):
+                step = self._newton(loads[missing] * (part / parts), now)
+                now, count = step.displacement, count + step.iterations
+            changed = {
+                item.name: getattr(found, item.name).index_copy(0, missing, getattr(step, item.name))
+                for item in fields(States)
+            }
+            found = replace(found, **{**changed, "iterations": found.iterations.index_add(0, missing, count)})
+            steps[missing] = parts
+            parts *= 2
+        return replace(found, load_steps=steps)
+
+    def _starts(self, loads: Tensor) -> Tensor:
+        """Of no displacement and the warped responses to parts of the loads, those of least energy, (s, n, 3)."""
+        linear = self._spread(self._at_rest.solve(loads.mT[None])[0].mT)
+        if self._warping is None:
+            return linear
+        best, lowest = torch.zeros_like(linear), torch.zeros(len(loads), dtype=self.dtype, device=self.device)
+        for share in _SHARES:
+            start = self._warping.warped(share * linear)
+            energy = self._at(loads, start).energy
+            is_lower = energy < lowest
+            best = torch.where(is_lower[:, None, None], start, best)
+            lowest = torch.where(is_lower, energy, lowest)
+        return best
+
+    def _at(self, loads: Tensor, displacement: Tensor) -> _Search:
+        """Energy and out-of-balance forces; the energy is infinite where a cell is inside out."""
+        with torch.no_grad():
+            stored, internal = self.elastic.energy_and_forces(displacement)
+            moved = self._picked(displacement)
+            energy = stored - (loads * moved).sum(dim=1)
+        return _Search(displacement, energy, loads - self._picked(internal))
+
+    def _newton(self, loads: Tensor, begin: Tensor) -> States:
+        now = self._at(loads, begin)
+        sizes = torch.linalg.vector_norm(loads, dim=1)
+        sizes = torch.where(sizes > 0.0, sizes, 1.0)
+        relative = torch.linalg.vector_norm(now.residual, dim=1) / sizes
+        iterations = torch.zeros(len(loads), dtype=torch.int64, device=self.device)
+        is_stable = torch.ones_like(relative, dtype=torch.bool)
+        active = torch.nonzero(~(relative <= self.settings.tolerance))[:, 0]
+        while len(active):
+            here = now[active]
+            factors, is_stable[active] = self._factored(here.displacement)
+            way = factors.solve(here.residual[:, :, None])[:, :, 0]
+            after, is_better = self._line_search(loads[active], here, way)
+            now.put(active, after)
+            relative[active] = torch.linalg.vector_norm(after.residual, dim=1) / sizes[active]
+            iterations[active] += 1
+            goes_on = is_better & (relative[active] > self.settings.tolerance)
+            active = active[goes_on & (iterations[active] < self.settings.iterations)]
+        is_converged = relative <= self.settings.tolerance
+        return States(now.displacement, relative, is_converged, iterations, torch.ones_like(iterations), is_stable)
+
+    def _factored(self, displacement: Tensor) -> tuple[Factors, Tensor]:
+        """Factors of the tangents, shifted until they are positive definite, and which of them were, (s,)."""
+        entries = self._matrices.assembled(self.elastic.cell_stiffnesses(displacement))
+        factors = self._matrices.factor(entries)
+        is_stable = factors.is_positive.clone()
+        for shift in _SHIFTS:
+            wrong = torch.nonzero(~factors.is_positive)[:, 0]
+            if not len(wrong):
+                break
+            shifted = self._matrices.factor(entries[wrong] + shift * self._rest)
+            factors.put(wrong, shifted)
+        return factors, is_stable
+
+    def _line_search(self, loads: Tensor, here: _Search, way: Tensor) -> tuple[_Search, Tensor]:
+        """Steps by Armijo's rule on the energy with quadratic interpolation, and whether there is one, (s,).
+
+        Where energies are equal to the last digits, the out-of-balance forces have to go down.
+        """
+        field = self._spread(way)
+        slope = -(here.residual * way).sum(dim=1)
+        best = _Search(here.displacement.clone(), here.energy.clone(), here.residual.clone())
+        length = torch.ones_like(slope)
+        left = torch.nonzero(torch.isfinite(way).all(dim=1) & (slope < 0.0))[:, 0]
+        is_better = torch.zeros_like(slope, dtype=torch.bool)
+        while len(left):
+            step = length[left]
+            there = self._at(loads[left], here.displacement[left] + step[:, None, None] * field[left])
+            change = there.energy - here.energy[left]
+            work = (loads[left] * self._picked(there.displacement)).sum(dim=1).abs()
+            noise = self._noise + _EPSILONS * self._epsilon * (here.energy[left].abs() + work)
+            is_less = torch.linalg.vector_norm(there.residual, dim=1) < torch.linalg.vector_norm(
+                here.residual[left], dim=1
+            )
+            is_good = (change <= _DESCENT * step * slope[left]) | ((change.abs() <= noise) & is_less)
+            best.put(left[is_good], there[is_good])
+            is_better[left[is_good]] = True
+            wanted = -slope[left] * step / (2.0 * (change / step - slope[left]))
+            wanted = torch.where(torch.isfinite(change), wanted, 0.5 * step)
+            length[left] = torch.minimum(torch.maximum(wanted, 0.1 * step), 0.5 * step)
+            left = left[~is_good & (length[left] > _SHORTEST)]
+        return best, is_better
