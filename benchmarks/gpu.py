@@ -1,7 +1,7 @@
-"""The fast path on a GPU: training, accuracy, latency and memory, from one tensors file, with torch alone.
+"""The fast path on a GPU: equilibria, training, accuracy, latency and memory, from one tensors file, with torch alone.
 
-    softtwin tensors beam/organ.toml beam.safetensors
-    python benchmarks/gpu.py beam.safetensors OUTPUT [--device cuda] [--small] [--minutes 8]
+    softtwin tensors beam/organ.toml beam.safetensors --precision double --no-jacobians
+    python benchmarks/gpu.py beam.safetensors OUTPUT [--device cuda] [--small] [--minutes 8] [--only PHASE ...]
 
 It asks for torch, NumPy, SciPy, safetensors and Lightning; no Zarr, VTK or FEniCSx. Phases run in the order of their
 worth; each is written into OUTPUT/gpu.json when it is finished, and the same command goes on with those missing.
@@ -18,7 +18,10 @@ import subprocess
 import time
 import traceback
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import cache, partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +30,10 @@ import torch
 from numpy.typing import NDArray
 
 from softtwin.meshes.metrics import nodal_distances, thesis_error
-from softtwin.reference.data.dataset import DataSet, Samples
+from softtwin.reference.data.dataset import DataSet, Samples, Split
+from softtwin.reference.data.samplers import LoadPlan, draw_load
 from softtwin.surrogate.architecture import Architecture
+from softtwin.surrogate.equilibria import Equilibria, NewtonSettings
 from softtwin.surrogate.evaluate import spread
 from softtwin.surrogate.export import Value
 from softtwin.surrogate.fast import FastSurrogate
@@ -58,6 +63,8 @@ class Row:
         epochs: passes over the samples; None: by seconds.
         seconds: wall time where there are no epochs.
         precision: of the training.
+        large: in double precision a prediction takes seconds.
+        samples: training samples that are made here; None for those of the data set.
     """
 
     name: str
@@ -65,7 +72,8 @@ class Row:
     epochs: int | None
     seconds: float = 60.0
     precision: Any = "single"
-    large: bool = False  # in double precision a prediction takes seconds
+    large: bool = False
+    samples: int | None = None
 
 
 def rows(small: bool) -> tuple[Row, ...]:
@@ -74,14 +82,31 @@ def rows(small: bool) -> tuple[Row, ...]:
         return (
             Row("reduced", Reduced(width=32), None, 3.0),
             Row("mlp", Perceptron(width=64), 2),
-            Row("umesh", UMesh(channels=4, levels=2), 1),
+            Row("umesh", UMesh(channels=4, levels=2), 1, samples=16),
         )
     return (
+        Row("umesh_128_full", UMesh(channels=128), None, 290.0, "mixed", large=True, samples=THESIS_SAMPLES),
         Row("reduced", Reduced(), None, 45.0),
         Row("mlp", Perceptron(), 100),
-        Row("umesh_128_mixed", UMesh(channels=128), None, 90.0, "mixed", large=True),
         Row("umesh_128_single", UMesh(channels=128), None, 60.0, large=True),
     )
+
+
+class Enlarged(DataSet):
+    """A data set with other training samples.
+
+    Args:
+        path: of the tensors file.
+        train: the samples.
+    """
+
+    def __init__(self, path: Path, train: Samples) -> None:
+        super().__init__(path)
+        self._train = train
+
+    def samples(self, split: Split, limit: int | None = None) -> Samples:
+        """The samples of a split; those of training are the others."""
+        return self._train if split == "train" else super().samples(split, limit)
 
 
 class Record:
@@ -131,6 +156,91 @@ def environment(data: DataSet, device: str) -> dict[str, Any]:
     }
 
 
+def whole(data: DataSet, forces: Floats) -> torch.Tensor:
+    """Forces at the loaded nodes, (s, l, 3), as forces at all, (s, n, 3)."""
+    out = np.zeros((len(forces), *data.body.points.shape))
+    out[:, data.response.loaded] = forces
+    return torch.from_numpy(out)
+
+
+def equilibria(data: DataSet, device: str, few: int | None) -> dict[str, Any]:
+    """The held-out loads solved together: how far from the reference's states, what failed, how many a second."""
+    samples = data.samples("test", few)
+    forces, truth = whole(data, samples.forces), samples.displacements
+    peak = np.abs(truth).max(axis=(1, 2))
+    found: dict[str, Any] = {"loads": len(truth)}
+    for precision, settings in (("double", NewtonSettings()), ("single", NewtonSettings(1e-4))):
+        solver = Equilibria(data.body, data.material, device, precision, settings)
+        solver.solve(forces)  # libraries load what they need
+        began = time.perf_counter()
+        states = solver.solve(forces)
+        displacement = states.displacement.cpu().double().numpy()
+        seconds = time.perf_counter() - began
+        off = np.abs(displacement - truth).max(axis=(1, 2)) / peak
+        iterations = states.iterations.cpu().numpy()
+        found[precision] = {
+            "tolerance": settings.tolerance,
+            "not_converged": int((~states.is_converged).sum()),
+            "unstable": int((~states.is_stable).sum()),
+            "in_load_steps": int((states.load_steps > 1).sum()),
+            "iterations": dict(zip(("mean", "p95", "max"), summary(iterations), strict=True)),
+            "off_from_reference": dict(zip(("mean", "p95", "max"), summary(off), strict=True)),
+            "off_median": float(np.median(off)),
+            "more_than_1e_8_off": int((off > 1e-8).sum()),
+            "seconds": seconds,
+            "states_per_s": len(truth) / seconds,
+        }
+    return found
+
+
+def summary(values: NDArray[Any]) -> tuple[float, float, float]:
+    """Mean, 95th percentile and largest."""
+    return float(values.mean()), float(np.percentile(values, 95)), float(values.max())
+
+
+def drawn(path: Path, numbers: range) -> Floats:
+    """Loads of some draws as `generate` draws them, (s, l, 3), newtons; their numbers lie behind those of the set."""
+    data = DataSet(path)
+    plan = data.header["plan"]
+    entries = {**plan["loads"], "zones": tuple(plan["loads"]["zones"]), "radius": tuple(plan["loads"]["radius"])}
+    loads, loaded = LoadPlan(**entries), data.response.loaded
+    chances = (np.random.default_rng([plan["seed"], 2, number]) for number in numbers)
+    return np.stack([plan["loads"]["amplitude"] * draw_load(data.body, data.shapes, loads, rng) for rng in chances])[
+        :, loaded
+    ]
+
+
+def generation(data: DataSet, device: str, count: int) -> tuple[Samples, dict[str, Any]]:
+    """Training samples that no other draw of the data set is, and what making them took."""
+    began = time.perf_counter()
+    first = data.block_count * data.header["block"]
+    parts = [range(i, min(i + 256, first + count)) for i in range(first, first + count, 256)]
+    with ProcessPoolExecutor(min(16, os.cpu_count() or 1), get_context("fork")) as pool:
+        forces = np.concatenate(list(pool.map(drawn, [data.path] * len(parts), parts)))
+    drawing = time.perf_counter() - began
+    solver = Equilibria(data.body, data.material, device)
+    began = time.perf_counter()
+    states = solver.solve(whole(data, forces))
+    displacement = states.displacement.cpu().numpy()
+    seconds = time.perf_counter() - began
+    kept = (states.is_converged & states.is_stable).cpu().numpy()
+    sizes = np.linalg.norm(displacement[kept], axis=(1, 2))
+    none = np.zeros((int(kept.sum()), 1))
+    samples = Samples(first + np.flatnonzero(kept), forces[kept], displacement[kept], none, np.zeros_like(forces[kept]))
+    return samples, {
+        "draws": count,
+        "not_converged": int((~states.is_converged).sum()),
+        "unstable": int((states.is_converged & ~states.is_stable).sum()),
+        "in_load_steps": int((states.load_steps > 1).sum()),
+        "iterations": dict(zip(("mean", "p95", "max"), summary(states.iterations.cpu().numpy()), strict=True)),
+        "displacement_norm_m": {"mean": float(sizes.mean()), "std": float(sizes.std())},
+        "drawing_seconds": drawing,
+        "solving_seconds": seconds,
+        "states_per_s": count / seconds,
+        "memory_mib": torch.cuda.max_memory_allocated() / 2**20 if device == "cuda" else None,
+    }
+
+
 def trained(row: Row, data: DataSet, device: Any) -> tuple[Surrogate, dict[str, Any]]:
     """A network of a row, and what its training took."""
     if device == "cuda":
@@ -175,6 +285,16 @@ def errors(found: Floats, samples: Samples) -> dict[str, Any]:
         "largest_error_m": asdict(spread(distances.max(axis=1))),
         "relative_error": asdict(spread(relative)),
     }
+
+
+def held_out(surrogate: Surrogate, data: DataSet, device: Any) -> dict[str, Any]:
+    """Errors on the test split, predicted in single precision without graphs."""
+    samples = data.samples("test")
+    plain = Value(surrogate, np.eye(3 * len(data.response.loaded))).to(device).eval().requires_grad_(False)
+    forces = torch.from_numpy(samples.forces.reshape(len(samples), -1)).float()
+    with torch.no_grad(), without_tf32():
+        found = torch.cat([plain(part.to(device)).cpu() for part in forces.split(64)])
+    return errors(found.double().numpy().reshape(samples.displacements.shape), samples)
 
 
 def latency(task: Callable[[], Any], calls: int) -> dict[str, float]:
@@ -254,6 +374,7 @@ def main() -> None:
     parser.add_argument("output", type=Path, help="folder of gpu.json")
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
     parser.add_argument("--small", action="store_true", help="tiny networks and few calls")
+    parser.add_argument("--only", nargs="*", help="phases; all if not given")
     parser.add_argument("--minutes", type=float, default=8.0, help="no phase begins after them")
     chosen = parser.parse_args()
     if chosen.device == "cuda" and not torch.cuda.is_available():
@@ -262,16 +383,28 @@ def main() -> None:
     record, deadline = Record(chosen.output / "gpu.json"), time.monotonic() + 60.0 * chosen.minutes
     data = DataSet(chosen.data)
     calls = 5 if chosen.small else CALLS
-    record.phase("environment", lambda: environment(data, chosen.device), deadline)
-    for row in rows(chosen.small):
-
-        def whole(row: Row = row) -> dict[str, Any]:
-            surrogate, told = trained(row, data, chosen.device)
-            return {"training": told, "prediction": prediction(surrogate, data, chosen.device, calls, row.large)}
-
-        record.phase(row.name, whole, deadline)
     few = 4 if chosen.small else 1000
-    record.phase("elastic_forces", lambda: elastic(data, chosen.device, few, max(5, calls // 10)), deadline)
+    made = cache(lambda count: generation(data, chosen.device, count))  # training takes them from memory
+
+    def trained_and_judged(row: Row) -> dict[str, Any]:
+        lesson = data if row.samples is None else Enlarged(chosen.data, made(row.samples)[0])
+        surrogate, told = trained(row, lesson, chosen.device)
+        return {
+            "training": told,
+            "prediction": prediction(surrogate, data, chosen.device, calls // 10 if row.large else calls, row.large),
+        }
+
+    phases: dict[str, Callable[[], Any]] = {
+        "environment": lambda: environment(data, chosen.device),
+        "equilibria": lambda: equilibria(data, chosen.device, few if chosen.small else None),
+        "generation": lambda: made(16 if chosen.small else THESIS_SAMPLES)[1],
+        **{row.name: partial(trained_and_judged, row) for row in rows(chosen.small)},
+        "elastic_forces": lambda: elastic(data, chosen.device, few, max(5, calls // 10)),
+    }
+    for name in chosen.only or phases:
+        if name not in phases:
+            parser.error(f"--only: expected some of {', '.join(phases)}, got {name}.")
+        record.phase(name, phases[name], deadline)
 
 
 if __name__ == "__main__":

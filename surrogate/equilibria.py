@@ -22,6 +22,7 @@ from .warping import Warping
 
 _DESCENT = 1e-4  # of what the slope promises (Nocedal and Wright, Numerical Optimization, section 3.1)
 _SHORTEST = 1e-8
+_LOST = 1e-6  # of the squares of the forces, that may lie on held nodes
 _SHARES = (1.0, 0.5, 0.25)  # of the load whose warped response is tried as a start
 _SHIFTS = tuple(0.01 * 4.0**i for i in range(10))  # of the stiffness at no load, added where a tangent is indefinite
 _TYPES = {"double": "float64", "single": "float32"}
@@ -33,7 +34,8 @@ class NewtonSettings:
     """When a state is found, and how long it is looked for.
 
     Args:
-        tolerance: out-of-balance forces relative to the load's, in the norm of all free components.
+        tolerance: out-of-balance forces relative to the load's, in the norm of all free components; rounding is enough
+            where it leaves more, as it does in single precision.
         iterations: of Newton's method, for one part of a load.
         load_steps: parts into which a load is cut, at most, where it is not found at once.
         chunk: states that are solved together, at most; None as many as the device's memory holds.
@@ -137,6 +139,9 @@ class Equilibria:
         unit = torch.eye(3, dtype=self.dtype, device=self.device).expand(*self.elastic.volumes.shape, 3, 3)
         self._epsilon = torch.finfo(self.dtype).eps
         stiffest = self.elastic.moduli(unit).amax(dim=(2, 3, 4, 5))
+        nodes, volume = len(body.points), float(self.elastic.volumes.sum())
+        self._force_scale = float(stiffest.max()) * (volume / nodes) ** (2 / 3) * nodes**0.5
+        self._stiffness_scale = float(self._rest.abs().max())
         self._noise = _EPSILONS * self._epsilon * float((stiffest * self.elastic.volumes).sum())
         if not bool(self._at_rest.is_positive.all()):
             raise ValueError(
@@ -159,13 +164,15 @@ class Equilibria:
         """States under loads; each in one step where that succeeds, else in 2, 4, ... parts of the load.
 
         Args:
-            forces: nodal forces, (s, n, 3), newtons; those at held nodes do nothing.
+            forces: nodal forces, (s, n, 3), newtons; none at held nodes.
             start: displacements to begin at, (s, n, 3), metres; none if not given.
 
         Raises:
-            ValueError: another shape, or numbers that are not finite.
+            ValueError: another shape, numbers that are not finite, or forces on held nodes, where they would be lost.
         """
         loads = self._picked(self._checked("forces", forces))
+        if loads.square().sum() < (1.0 - _LOST) * forces.square().sum():
+            raise ValueError("Equilibria.forces: expected no force on held nodes, where it would be lost; got some.")
         begin = None
         if start is not None:
             begin = self._spread(self._picked(self._checked("start", start)))
@@ -246,6 +253,7 @@ class Equilibria:
         relative = torch.linalg.vector_norm(now.residual, dim=1) / sizes
         iterations = torch.zeros(len(loads), dtype=torch.int64, device=self.device)
         is_stable = torch.ones_like(relative, dtype=torch.bool)
+        is_rounding = torch.zeros_like(is_stable)
         active = torch.nonzero(~(relative <= self.settings.tolerance))[:, 0]
         while len(active):
             here = now[active]
@@ -253,12 +261,20 @@ class Equilibria:
             way = factors.solve(here.residual[:, :, None])[:, :, 0]
             after, is_better = self._line_search(loads[active], here, way)
             now.put(active, after)
-            relative[active] = torch.linalg.vector_norm(after.residual, dim=1) / sizes[active]
+            left = torch.linalg.vector_norm(after.residual, dim=1)
+            is_stuck = ~is_better | (left > 0.5 * relative[active] * sizes[active])
+            is_rounding[active] = is_stuck & (left <= self._round_off(after.displacement))
+            relative[active] = left / sizes[active]
             iterations[active] += 1
-            goes_on = is_better & (relative[active] > self.settings.tolerance)
+            goes_on = is_better & ~is_rounding[active] & (relative[active] > self.settings.tolerance)
             active = active[goes_on & (iterations[active] < self.settings.iterations)]
-        is_converged = relative <= self.settings.tolerance
+        is_converged = (relative <= self.settings.tolerance) | is_rounding
         return States(now.displacement, relative, is_converged, iterations, torch.ones_like(iterations), is_stable)
+
+    def _round_off(self, displacement: Tensor) -> Tensor:
+        """Norm of what rounding leaves of strains, 1 + grad u, and of K u in out-of-balance forces, (s,), newtons."""
+        sizes = torch.linalg.vector_norm(displacement, dim=(1, 2))
+        return _EPSILONS * self._epsilon * (self._force_scale + self._stiffness_scale * sizes)
 
     def _factored(self, displacement: Tensor) -> tuple[Factors, Tensor]:
         """Factors of the tangents, shifted until they are positive definite, and which of them were, (s,)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .residual import ElasticBody
@@ -21,7 +22,7 @@ class Warping:
         layers: layer of each free node, (n,), -1 where it is held.
     """
 
-    def __init__(self, elastic: ElasticBody, layers: np.ndarray) -> None:
+    def __init__(self, elastic: ElasticBody, layers: NDArray[np.int64]) -> None:
         self.elastic = elastic
         free = np.flatnonzero(layers >= 0)
         numbers = np.full(len(layers), len(free))
