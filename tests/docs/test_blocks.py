@@ -24,7 +24,7 @@ from .conftest import PAGES, ROOT, Block, CommandLines, blocks_of, commands_of, 
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
 
 # Pages whose Python runs here, by their names from the root. What they need beside an empty folder: `twin_folder`.
-ALONE = ["docs/materials.md", "docs/networks.md"]
+ALONE = ["docs/gpu.md", "docs/materials.md", "docs/networks.md"]
 WITH_A_TWIN = ["README.md", "docs/registration.md"]
 WHOLE = ["docs/tutorial.md"]  # commands and Python, one after the other, as a reader goes through them
 A_PAGE = ["docs/live.md"]  # Python that shows a page in a browser
