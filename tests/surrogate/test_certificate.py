@@ -143,7 +143,8 @@ def test_a_higher_confidence_is_a_wider_bound(bare: Surrogate, data: DataSet, su
         surrogate,
         calibrate(bare, data, confidence=0.97, stepped=0),
     ]
-    narrow, usual, wide = ([ErrorEstimator(each).bound_error(load) for load in loads(data, 32)] for each in known)
+    estimators = [ErrorEstimator(each) for each in known]
+    narrow, usual, wide = ([one.bound_error(load) for load in loads(data, 32)] for one in estimators)
     medians = [np.median([each.mean for each in given]) for given in (narrow, usual, wide)]
     assert 0.0 < medians[0] < medians[1] < medians[2]
     assert all(each.mean <= each.largest for each in usual)
@@ -376,7 +377,8 @@ def test_a_load_far_out_among_those_on_its_nodes_is_told(surrogate: Surrogate, d
 
 def test_few_of_the_held_out_loads_are_far_out_among_those_on_their_nodes(surrogate: Surrogate, data: DataSet) -> None:
     known = surrogate.card["certificate"]["limits"]["load"]
-    given = [typical_ratio(ErrorEstimator(surrogate).bound_error(load).indicators, known) for load in loads(data, 16)]
+    estimator = ErrorEstimator(surrogate)
+    given = [typical_ratio(estimator.bound_error(load).indicators, known) for load in loads(data, 16)]
     assert np.mean([ratio > 1.0 for ratio in given]) < 0.2
 
 
