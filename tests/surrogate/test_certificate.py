@@ -22,7 +22,7 @@ from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.generate import Plan, generate, ramp_loads
 from softtwin.reference.solve.problem import Problem
-from softtwin.surrogate.calibration import CalibrationWarning, calibrate, coverage, needed, quantile
+from softtwin.surrogate.calibration import CalibrationWarning, Coverage, calibrate, coverage, needed, quantile
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.error_bound import ErrorEstimator, typical_ratio
 from softtwin.surrogate.error_indicators import CalibrationError, IndicatorReader
@@ -76,13 +76,18 @@ def of_nobody(displacement: np.ndarray) -> SimpleNamespace:
 # ---------------------------------------------------------------------- what they are worth
 
 
+@pytest.fixture(scope="module")
+def covered(surrogate: Surrogate, data: DataSet) -> Coverage:
+    return coverage(surrogate, data)
+
+
 @pytest.mark.parametrize("error", ["mean", "largest"])
-def test_as_many_samples_keep_their_bounds_as_should(surrogate: Surrogate, data: DataSet, error: str) -> None:
+def test_as_many_samples_keep_their_bounds_as_should(covered: Coverage, error: str) -> None:
     """Of 256 with a bound for 90 %: three standard deviations of what chance in both splits leaves.
 
     Three of the limits set one in a hundred aside each, and the largest size of the calibration one in 257.
     """
-    found = coverage(surrogate, data)
+    found = covered
     assert abs(found.kept[error] - 0.9) < 3.0 * np.sqrt(2 * 0.09 / 256)
     assert sum(found.in_range) == found.samples and len(found.in_range) == 4
     assert found.rank_correlation[error] > 0.85
