@@ -26,12 +26,12 @@ import numpy as np
 import zstandard
 from columns import Column, cell
 from harness import Benchmark, Setting, run
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 from summaries import resident_mib
 
 CHROMIUM = Path("/usr/bin/chromium")
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-VIEW = {"width": 1280, "height": 800}
+VIEW: ViewportSize = {"width": 1280, "height": 800}
 PLACE = (0.62, 0.47)  # of the organ in the part of the page that shows it, where the mouse takes hold
 _HEAD = 16  # bytes: sizes of what follows, before and after it was packed
 
@@ -115,9 +115,9 @@ main(sys.argv[1:])
 """
 
 
-def opened(browser: Browser, address: str) -> tuple[Page, Heard]:
+def opened(browser: Browser, address: str, view: ViewportSize = VIEW) -> tuple[Page, Heard]:
     """A page with the demo in it, and what it hears."""
-    page, heard = browser.new_page(viewport=VIEW), Heard()
+    page, heard = browser.new_page(viewport=view), Heard()
     page.on("websocket", lambda wire: (wire.on("framereceived", heard.take), wire.on("framesent", heard.give)))
     page.goto(f"http://{address}", timeout=120_000)
     page.wait_for_selector("canvas", timeout=120_000)

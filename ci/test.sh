@@ -17,6 +17,7 @@ if [ ! -x /usr/bin/chromium ] && command -v apt-get >/dev/null; then
         --no-install-recommends chromium; } </dev/null ||
         say "chromium could not be installed: the page is tried in no browser"
 fi
+unset PYTHONDONTWRITEBYTECODE # images set it: each of the many programs that tests start would compile torch anew
 export OMP_NUM_THREADS=1 # torch's networks here are small: on cores that others use, its threads wait for each other
 export PATH="$VENV/bin:$PATH" PYTHONUNBUFFERED=1 # unbuffered, or a test that forks prints the lines before it twice
 LOGS="$ROOT/build/ci"
@@ -61,12 +62,35 @@ group() {
     outcome "$name" "${PIPESTATUS[0]}"
 }
 
-# aside NAME COMMAND...: the same beside other groups, shown when all of them have ended.
-aside() {
-    local name=$1
-    shift
-    "$@" >"$LOGS/$name.log" 2>&1
-    outcome "$name" $?
+# lane NAME...: those that are asked for, one after the other, beside the groups that follow until `join`.
+lane() {
+    local name
+    BESIDE=()
+    for name in "$@"; do
+        if asked "$name"; then
+            begin "$name"
+            BESIDE+=("$name")
+        fi
+    done
+    set -m # a process group of its own, that an interrupt ends whole
+    for name in "${BESIDE[@]}"; do
+        "$name" >"$LOGS/$name.log" 2>&1
+        outcome "$name" $?
+    done &
+    LANE=$!
+    set +m
+    trap 'kill -- -"$LANE" 2>/dev/null' EXIT
+}
+
+# join: waits for the groups of the lane and shows what they said.
+join() {
+    local name
+    wait "$LANE"
+    trap - EXIT
+    for name in "${BESIDE[@]}"; do
+        printf '\n== %s\n' "$name"
+        cat "$LOGS/$name.log"
+    done
 }
 
 format() { ruff format --check .; }
@@ -94,15 +118,22 @@ run_tests() {
 }
 # Each worker is one process with one thread; one that has nothing left takes tests from the other.
 parallel=(-n "$WORKERS" --dist worksteal)
-tests() { run_tests tests "${parallel[@]}" -m "not mpi and not browser and not slow" tests; }
-# Ranks of MPI want the cores for themselves.
-ranks() { run_tests ranks -m "mpi and not slow" tests; }
-# A browser waits more than it works: what needs one core and reads no browser runs beside it.
-browser() { run_tests browser -m "browser and not slow" tests; }
+tests() {
+    local apart="mpi or browser or slow"
+    # The group contract runs these in an environment that has no FEniCSx, for this Python alone.
+    "$SYSTEM_PYTHON" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' && apart+=" or contract"
+    run_tests tests "${parallel[@]}" -m "not ($apart)" tests
+}
+# marked NAME: the files with such tests. Only these are imported: all of them take a quarter of a minute.
+marked() { grep -rl --include='*.py' "mark\.$1\b" tests; }
+# One after the other: each starts ranks for both cores, or a browser that draws on one of them.
+ranks() { run_tests ranks -m "mpi and not slow" $(marked mpi); }
+browser() { run_tests browser -m "browser and not slow" $(marked browser); }
 contract() { bash ci/no-fenicsx.sh contract "$LOGS/contract.xml"; }
 slow() { run_tests slow "${parallel[@]}" -m "slow and not mpi and not browser" tests; }
 slow_apart() { run_tests slow-apart -m "slow and (mpi or browser)" tests; }
 
+lane types
 group format format
 group lint lint
 group layers layers
@@ -110,6 +141,7 @@ group docs docs
 if [ -f build/site/index.html ] && grep -qs ^passed "$LOGS/docs.outcome"; then
     export SOFTTWIN_SITE="$ROOT/build/site" # the tests of the site read this one
 fi
+join
 group tests tests
 if [ ! -d ../shared/data/liver ]; then
     asked liver && NAMES+=(liver)
@@ -118,25 +150,9 @@ if [ ! -d ../shared/data/liver ]; then
 elif [ ${#ASKED[@]} != 0 ]; then # else among the tests
     group liver run_tests liver "${parallel[@]}" -m "liver and not slow" tests
 fi
-group ranks ranks
-BESIDE=()
-for name in types contract; do
-    if asked $name; then
-        begin $name
-        BESIDE+=("$name")
-    fi
-done
-set -m # a process group of its own, that an interrupt ends whole
-for name in "${BESIDE[@]}"; do aside "$name" "$name"; done &
-LANE=$!
-set +m
-trap 'kill -- -"$LANE" 2>/dev/null' EXIT
+lane ranks contract # a browser leaves a core idle, and whoever starts programs waits for them
 group browser browser
-wait $LANE
-for name in "${BESIDE[@]}"; do
-    printf '\n== %s\n' "$name"
-    cat "$LOGS/$name.log"
-done
+join
 if [ $ALL = 1 ] || [ ${#ASKED[@]} != 0 ]; then
     group slow slow
     group slow-apart slow_apart

@@ -102,12 +102,9 @@ def test_poissons_ratio_may_be_another(quickstart: Path) -> None:
         assert twin.model_error["poisson_ratio"] == [0.3, 0.4] and twin.model_error["attachment"] == 0.0
 
 
-def test_the_record_and_the_report_say_so(quickstart: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_record_says_so(quickstart: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(capsys, "register", quickstart, quickstart / "demo" / CLOUD, "--output", quickstart / "mine")
     assert json.loads((quickstart / "mine" / "registration.json").read_text())["model_error"]["attachment"] == 0.004
-    run(capsys, "report", quickstart)
-    page = (quickstart / "report.html").read_text()
-    assert "and for an attachment that lies elsewhere by some 4.0 mm along each axis; not for a wrong shape" in page
 
 
 def test_the_file_of_before_is_read(quickstart: Path) -> None:

@@ -43,7 +43,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def made(files: Path, **entries: Any) -> Organ:
-    base = {"source": "total.nii.gz:ras", "unit": "mm", "nodes": 200, "fixed": "touching:vena_cava"}
+    base = {"source": "total.nii.gz:ras", "unit": "mm", "cell_size": 0.014, "fixed": "touching:vena_cava"}
     return make_organ(parse_config({"body": base | entries}).body, files)
 
 
@@ -159,7 +159,7 @@ def test_the_real_liver_comes_back_from_flat_voxels(liver_folder: Path, tmp_path
     write_nifti(tmp_path / "liver.nii.gz", grid, mask.astype(np.uint8), {1: "liver"})
     picked = points[fixed[0]]
     held = f"ball:{','.join(f'{1e3 * x:.2f}' for x in picked * (-1, -1, 1))}:20mm"
-    section = {"source": "liver.nii.gz:ras", "unit": "mm", "nodes": 1200, "fixed": held}
+    section = {"source": "liver.nii.gz:ras", "unit": "mm", "cell_size": 0.0153, "fixed": held}
     worst = []
     for _ in range(3):  # fTetWild meshes differently each time: where one node is too far off, two more have to be near
         body = make_organ(parse_config({"body": section}).body, tmp_path).body

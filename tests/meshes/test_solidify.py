@@ -112,7 +112,7 @@ def test_two_balls_that_overlap_become_one(ball: Surface) -> None:
     assert Body(solid.points, solid.cells, {}).volume == pytest.approx(2 * ball.volume - 2 * cap, rel=0.03)
 
 
-@pytest.mark.parametrize("node_count", [250, 800])
+@pytest.mark.parametrize("node_count", [150, 450, pytest.param(800, marks=pytest.mark.slow)])
 def test_a_wanted_number_of_nodes_is_about_met(
     ball: Surface, node_count: int, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -22,7 +22,7 @@ from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.generate import Plan, generate, ramp_loads
 from softtwin.reference.solve.problem import Problem
-from softtwin.surrogate.calibration import CalibrationWarning, calibrate, coverage, needed, quantile
+from softtwin.surrogate.calibration import CalibrationWarning, Coverage, calibrate, coverage, needed, quantile
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.error_bound import ErrorEstimator, typical_ratio
 from softtwin.surrogate.error_indicators import CalibrationError, IndicatorReader
@@ -76,13 +76,18 @@ def of_nobody(displacement: np.ndarray) -> SimpleNamespace:
 # ---------------------------------------------------------------------- what they are worth
 
 
+@pytest.fixture(scope="module")
+def covered(surrogate: Surrogate, data: DataSet) -> Coverage:
+    return coverage(surrogate, data)
+
+
 @pytest.mark.parametrize("error", ["mean", "largest"])
-def test_as_many_samples_keep_their_bounds_as_should(surrogate: Surrogate, data: DataSet, error: str) -> None:
+def test_as_many_samples_keep_their_bounds_as_should(covered: Coverage, error: str) -> None:
     """Of 256 with a bound for 90 %: three standard deviations of what chance in both splits leaves.
 
     Three of the limits set one in a hundred aside each, and the largest size of the calibration one in 257.
     """
-    found = coverage(surrogate, data)
+    found = covered
     assert abs(found.kept[error] - 0.9) < 3.0 * np.sqrt(2 * 0.09 / 256)
     assert sum(found.in_range) == found.samples and len(found.in_range) == 4
     assert found.rank_correlation[error] > 0.85
@@ -143,7 +148,8 @@ def test_a_higher_confidence_is_a_wider_bound(bare: Surrogate, data: DataSet, su
         surrogate,
         calibrate(bare, data, confidence=0.97, stepped=0),
     ]
-    narrow, usual, wide = ([ErrorEstimator(each).bound_error(load) for load in loads(data, 32)] for each in known)
+    estimators = [ErrorEstimator(each) for each in known]
+    narrow, usual, wide = ([one.bound_error(load) for load in loads(data, 32)] for one in estimators)
     medians = [np.median([each.mean for each in given]) for given in (narrow, usual, wide)]
     assert 0.0 < medians[0] < medians[1] < medians[2]
     assert all(each.mean <= each.largest for each in usual)
@@ -376,7 +382,8 @@ def test_a_load_far_out_among_those_on_its_nodes_is_told(surrogate: Surrogate, d
 
 def test_few_of_the_held_out_loads_are_far_out_among_those_on_their_nodes(surrogate: Surrogate, data: DataSet) -> None:
     known = surrogate.card["certificate"]["limits"]["load"]
-    given = [typical_ratio(ErrorEstimator(surrogate).bound_error(load).indicators, known) for load in loads(data, 16)]
+    estimator = ErrorEstimator(surrogate)
+    given = [typical_ratio(estimator.bound_error(load).indicators, known) for load in loads(data, 16)]
     assert np.mean([ratio > 1.0 for ratio in given]) < 0.2
 
 
