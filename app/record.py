@@ -81,6 +81,8 @@ class Recorder:
         if frame.missing:
             row["points_missing"] = frame.missing
         row |= {"reasons": list(frame.judgement.reasons), "seconds": frame.seconds, "files": [], **more}
+        if frame.judgement.checks:
+            row["checks"] = [check.figures() for check in frame.judgement.checks]
         if frame.landmarks:
             row["landmarks"] = frame.landmarks
         if frame.registration is not None:

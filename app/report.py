@@ -122,6 +122,7 @@ def _fill_template(space: Workspace, studio: Studio, sections: Mapping[str, Sect
         vector=_vector,
         interval=_interval,
         mm2=_square_millimetres,
+        measure=_measure,
     )
     environment.globals.update(gradient=_gradient, norm=np.linalg.norm)
     environment.globals.update(displacement_colours=DISPLACEMENT, error_colours=_ERROR)
@@ -147,6 +148,13 @@ def figure(value: float) -> str:
 
 def _vector(values: Sequence[float | None]) -> str:
     return "(" + ", ".join(map(_signed, values)) + ")"
+
+
+def _measure(value: float | None, unit: str) -> str:
+    """A statistic with its unit, metres as millimetres."""
+    if value is None:
+        return "–"
+    return f"{figure(1e3 * value)} mm" if unit == "m" else f"{figure(value)} {unit}".strip()
 
 
 def _square_millimetres(values: Sequence[float | None]) -> str:
@@ -446,6 +454,7 @@ def _figures(body: Body, state: _State, truth: Floats, cloud: Floats, targets: M
         "outcome": str(state.row.get("outcome", "")).replace("_", " "),
         "verdict": state.row.get("verdict", ""),
         "reasons": state.row.get("reasons", []),
+        "checks": state.row.get("checks", []),
     }
 
 

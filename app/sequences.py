@@ -22,6 +22,7 @@ from .record import RECORD, describe_estimate
 Floats = NDArray[np.float64]
 Section = dict[str, Any]
 _LISTED = 40  # rows of the table: the first, the last, and those that were not accepted
+_CHECKED = 5  # frames whose checks are shown: the first, and those that were not accepted
 _WORST = ("accepted", "doubtful", "refused")
 _COLOURS = {"accepted": "#2f9e44", "doubtful": "#e8a33d", "refused": "#d9480f"}
 
@@ -71,6 +72,11 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
         "colours": _COLOURS,
         "rows": shown,
         "unlisted": len(rows) - len(shown),
+        "checked": [
+            row
+            for row in (shown[:1] + [row for row in shown[1:] if row["verdict"] != "accepted"])[:_CHECKED]
+            if row.get("checks")
+        ],
         "targets": list(body.inner),
         "model_error": _model_error(record.get("model_error", record.get("doubt", {}))),
         "drafted": any("draft" in row for row in rows),

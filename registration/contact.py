@@ -16,6 +16,7 @@ from .parameter_blocks import Estimate, ParameterBlocks, check_deviation, estima
 from .priors import known_forces
 from .registrar import Registrar
 from .result import Registration
+from .verdict import Check, Code, Verdict
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -162,11 +163,21 @@ class ContactRegistrar:
             return replace(draft, seconds=time.perf_counter() - begin)
         found = self._registrar(draft).with_prior(draft.problem.correlated).register(cloud)
         minimum = max(draft.scatter, self.anywhere.noise.minimum)
-        if found.scatter > _WORSE * minimum:
-            found = found.with_reason(
-                f"one contact does not explain the cloud: points lie {1e3 * found.scatter:.2f} mm from the surface, "
-                f"with forces anywhere {1e3 * draft.scatter:.2f} mm"
+        is_worse = found.scatter > _WORSE * minimum
+        reason = (
+            f"one contact does not explain the cloud: points lie {1e3 * found.scatter:.2f} mm from the surface, "
+            f"with forces anywhere {1e3 * draft.scatter:.2f} mm"
+        )
+        found = found.with_check(
+            Check(
+                Code.CONTACT,
+                Verdict.DOUBTFUL if is_worse else Verdict.ACCEPTED,
+                found.scatter / minimum,
+                _WORSE,
+                "times the distances with forces anywhere",
+                reason=reason if is_worse else "",
             )
+        )
         return replace(found, draft=draft, seconds=time.perf_counter() - begin)
 
     def _registrar(self, draft: Registration) -> Registrar:

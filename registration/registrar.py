@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.meshes.clouds import check_cloud
 from softtwin.reference.data.outcome import NotConverged
 
+from .checks import Expectations, judge, shared
 from .cloud import Cloud
 from .correlated import CorrelatedNoise, is_noise
 from .forward import ForwardModel, ReducedModel, reduce_model
@@ -43,7 +44,7 @@ from .priors import (
 from .problem import Evaluation, Problem
 from .residuals import SurfaceDistance
 from .result import Registration, badness
-from .verdict import Expectations, Verdict, judge, shared
+from .verdict import Check, Code, Verdict
 
 Floats = NDArray[np.float64]
 # Of the logarithm of a nodal force: with more, forces explain noise and the model's error. Without either, a pull at a
@@ -190,12 +191,8 @@ class Registrar:
             return found
         with suppress(NotConverged):
             other = self.anywhere().limited(self.options.solver.until).with_landmarks(self.landmarks).register(cloud)
-            if other.judgement.is_usable and other.evaluation.match.rms < _EXPLAINED * match.rms:
-                reason = (
-                    f"forces outside the zone explain the cloud better: points lie {1e3 * match.rms:.2f} mm "
-                    f"from the surface, with forces anywhere {1e3 * other.evaluation.match.rms:.2f} mm"
-                )
-                return found.with_reason(reason)
+            if other.judgement.is_usable:
+                return found.with_check(_elsewhere(match.rms, other.evaluation.match.rms))
         return found
 
     def _registered(self, cloud: ArrayLike, start: Registration | None) -> Registration:
@@ -710,7 +707,23 @@ def _carried(result: Registration, before: Registration) -> Registration:
 
 def _doubtful(found: Registration, length: float, why: str) -> Registration:
     """The result with one reason more: neighbours within a length, metres, err alike."""
-    return found.with_reason(f"points within {1e3 * length:.0f} mm of each other err alike, {why}")
+    reason = f"points within {1e3 * length:.0f} mm of each other err alike, {why}"
+    return found.with_check(Check(Code.CORRELATED_NOISE, Verdict.DOUBTFUL, length, None, "m", reason=reason))
+
+
+def _elsewhere(within: float, anywhere: float) -> Check:
+    """Whether forces outside the zone explain a cloud better: root mean square distances with both, metres."""
+    ratio = anywhere / within
+    is_better = ratio < _EXPLAINED
+    reason = (
+        f"forces outside the zone explain the cloud better: points lie {1e3 * within:.2f} mm from the surface, with "
+        f"forces anywhere {1e3 * anywhere:.2f} mm"
+    )
+    verdict = Verdict.DOUBTFUL if is_better else Verdict.ACCEPTED
+    unit = "of the distances that are left"
+    return Check(
+        Code.FORCES_ELSEWHERE, verdict, ratio, _EXPLAINED, unit, is_minimum=True, reason=reason if is_better else ""
+    )
 
 
 def _resized(found: SolverResult, part: slice) -> float:

@@ -19,7 +19,7 @@ from .posterior import Posterior
 from .prepared import Prepared
 from .problem import Evaluation, Problem
 from .uncertainty import CoordinateFrame, Uncertainty, uncertainty
-from .verdict import Judgement, Verdict
+from .verdict import Check, Judgement, Verdict
 
 Floats = NDArray[np.float64]
 
@@ -90,11 +90,9 @@ class Registration:
     unexplained: float = 0.0
     draft: Registration | None = None
 
-    def with_reason(self, reason: str) -> Registration:
-        """The same with a reason more to doubt it; what is refused stays so."""
-        judged = self.judgement
-        verdict = Verdict.DOUBTFUL if judged.is_usable else judged.verdict
-        return replace(self, judgement=Judgement(verdict, (*judged.reasons, reason)))
+    def with_check(self, check: Check) -> Registration:
+        """The same with a check more; what is refused stays so."""
+        return replace(self, judgement=self.judgement.with_check(check))
 
     @property
     def coefficients(self) -> Floats:

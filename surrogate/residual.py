@@ -110,7 +110,7 @@ class ElasticBody(nn.Module):
         with torch.enable_grad():
             at = F if is_differentiated else F.requires_grad_()
             (stress,) = torch.autograd.grad(self.density(at).sum(), at, create_graph=is_differentiated)
-        return self.gathered(stress)
+        return self.assembled(stress)
 
     def energy_and_forces(self, displacement: Tensor) -> tuple[Tensor, Tensor]:
         """Strain energy, (s,), joules, and its derivative, (s, n, 3), newtons, of states that carry no derivatives.
@@ -125,9 +125,9 @@ class ElasticBody(nn.Module):
         density = density.detach()
         is_sound = (TorchAlgebra(F).det(F.detach()) > 0.0) | self.material.is_linear
         energy = torch.where(is_sound, density * self.volumes, torch.inf).sum(dim=(1, 2))
-        return energy, self.gathered(stress)
+        return energy, self.assembled(stress)
 
-    def gathered(self, stress: Tensor) -> Tensor:
+    def assembled(self, stress: Tensor) -> Tensor:
         """Nodal forces, (s, n, 3), newtons, of stresses P at the points of the quadrature, (s, cells, q, 3, 3)."""
         shares = torch.einsum("scqij,cqkj,cq->scki", stress, self.gradients, self.volumes)
         forces = torch.zeros(len(stress), self.nodes, 3, dtype=stress.dtype, device=stress.device)

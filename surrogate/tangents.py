@@ -45,12 +45,12 @@ class LayeredMatrices:
     """Symmetric matrices of one body, s at a time, whose unknowns lie in layers: block tridiagonal.
 
     Args:
-        unknowns: numbers of the cells' unknowns, (cells, w); `count` stands for one that is held.
+        numbers: of the cells' unknowns, (cells, w); `count` stands for one that is held.
         layers: layer of each unknown, (u,).
     """
 
-    def __init__(self, unknowns: Tensor, layers: Ints) -> None:
-        device, count = unknowns.device, len(layers)
+    def __init__(self, numbers: Tensor, layers: Ints) -> None:
+        device, count = numbers.device, len(layers)
         order = np.argsort(layers, kind="stable")
         self.sizes = np.bincount(layers).tolist()
         first = np.concatenate([[0], np.cumsum(self.sizes)])
@@ -63,8 +63,8 @@ class LayeredMatrices:
         self._own = np.concatenate([[0], np.cumsum(own)]).astype(np.int64)
         self._below = self._own[-1] + np.concatenate([[0], np.cumsum(below)]).astype(np.int64)
         self.entries = int(self._below[-1])
-        numbers = unknowns.cpu().numpy()
-        rows, columns = np.broadcast_arrays(numbers[:, :, None], numbers[:, None, :])
+        entries = numbers.cpu().numpy()
+        rows, columns = np.broadcast_arrays(entries[:, :, None], entries[:, None, :])
         rows, columns = rows.ravel(), columns.ravel()
         kept = np.flatnonzero((rows < count) & (columns < count))
         row, column = rows[kept], columns[kept]

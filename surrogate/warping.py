@@ -42,7 +42,7 @@ class Warping:
         angle = (W.square().sum(dim=(-2, -1), keepdim=True) / 2).sqrt()
         turn = torch.sinc(angle / torch.pi) * W + 0.5 * torch.sinc(angle / (2 * torch.pi)) ** 2 * (W @ W)
         wanted = (identity + turn) @ (identity + e) - identity
-        right = self.elastic.gathered(wanted)[:, self._free]  # (s, f, 3)
+        right = self.elastic.assembled(wanted)[:, self._free]  # (s, f, 3)
         count = len(right)
         columns = right.permute(1, 0, 2).reshape(1, -1, 3 * count)
         field = self._poisson.solve(columns).reshape(-1, count, 3).permute(1, 0, 2)

@@ -240,6 +240,13 @@ def test_every_frame_is_written_with_its_verdict(plain_twin: Twin, cloud, forces
     assert record["body"] == plain_twin.body.fingerprint and record["options"]["zone"] == "tip"
     first, second, third = record["frames"]
     assert first["verdict"] == "accepted" and first["reasons"] == [] and first["outcome"] == "converged"
+    misfit = next(check for check in first["checks"] if check["code"] == "misfit")
+    assert (
+        misfit["verdict"] == "accepted"
+        and 0.0 < misfit["statistic"] < misfit["level"]
+        and 0.0 < misfit["p_value"] < 1.0
+    )
+    assert "checks" not in second  # nothing was registered
     assert first["error"]["mean"] < 5e-4 and first["targets"]["tumour"]["error_m"] < 5e-4
     assert np.allclose(first["pose"], np.eye(4))
     deviations = np.sqrt(np.diag(first["net_force_covariance_N2"]))

@@ -33,7 +33,7 @@ from softtwin.registration.parameter_blocks import Estimate
 from softtwin.registration.pose import Pose
 from softtwin.registration.result import Registration
 from softtwin.registration.uncertainty import Uncertainty
-from softtwin.registration.verdict import Judgement, Verdict
+from softtwin.registration.verdict import Check, Code, Judgement, Verdict
 
 SPLITS = {"train": 4, "validation": 2, "test": 2}
 COMMANDS = {
@@ -169,7 +169,7 @@ def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[s
     with Recorder(Exporter(twin, folder)) as recorder:
         for number, shape in enumerate(shapes):
             refused = number == 1
-            verdict = Judgement(*((Verdict.REFUSED, ("too <far>",)) if refused else (Verdict.ACCEPTED,)))
+            verdict = Judgement.of((some_check(refused),))
             state = SimpleNamespace(displacement=shape)
             result = Registration(
                 prepared=None,  # type: ignore[arg-type]
@@ -204,6 +204,13 @@ def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[s
             )
             recorder.add(Frame(number, verdict, result, 0.1, body.points + shape), f"cloud_{number}.ply")
         recorder.add(Frame(frames, Judgement(Verdict.REFUSED, ("an empty cloud.",)), None, 0.0), "empty.ply")
+
+
+def some_check(refused: bool) -> Check:
+    worst, reason = (Verdict.REFUSED, "too <far>") if refused else (Verdict.ACCEPTED, "")
+    return Check(
+        Code.MISFIT, worst, 5e-3 if refused else 5e-4, 2e-3, "m", law="log-normal", p_value=0.25, reason=reason
+    )
 
 
 def workspace(root: Path, **entries: Any) -> Workspace:
@@ -309,6 +316,7 @@ def test_the_users_own_registrations_are_shown(page: Page) -> None:
     assert "5 frames with the surrogate, forces on all loaded nodes: 3 accepted, 2 refused." in text
     assert "Files: mm, LPS. Forces: newtons, LPS." in text and "Pose: metres, LPS, as the clouds." in text
     assert "Worst frame (1): refused, too <far>." in text
+    assert "Frame 1: 1 check" in text and "misfit5 mmat most 2 mm0.25refused" in text
     assert "empty.ply" in text and "an empty cloud." in text
     assert "Young's modulus 4000 Pa (3900 to 12345), not told by the cloud" in text
     assert "0.500 ± 0.017" in text and "90 %: x -0.016 to +0.016" in text

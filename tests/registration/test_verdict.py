@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body
+from softtwin.registration.checks import shared, thickness
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import expected_force
 from softtwin.registration.priors import nodal_forces
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.verdict import Verdict, shared, thickness
+from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
 
