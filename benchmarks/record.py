@@ -8,12 +8,14 @@ record's own commit, with `-dirty` where the tree had uncommitted changes, or no
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import platform
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -156,6 +158,18 @@ def write(name: str, figures: Any, made: dict[str, Any], command: str, begun: st
     partly.write_text(json.dumps(record, indent=1, default=plain) + "\n")
     partly.replace(path)
     return path
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """The records for this process alone, while it adds a row to one that others add rows to."""
+    RESULTS.mkdir(exist_ok=True)
+    folder = os.open(RESULTS, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)
 
 
 def plain(value: Any) -> Any:
