@@ -85,8 +85,9 @@ ROWS: dict[str, Moved] = {
 }
 
 
-def judged(result: Registration, rest: Floats, truth: Floats) -> dict[str, Any]:
+def judged(result: Registration, rest: Floats, truth: Floats, force: Floats) -> dict[str, Any]:
     """Errors and doubt of one frame."""
+    off = result.net_force - force
     errors, known = np.linalg.norm(rest + result.displacement - truth, axis=1), result.uncertainty
     reasons = result.judgement.reasons
     return {
@@ -94,6 +95,8 @@ def judged(result: Registration, rest: Floats, truth: Floats) -> dict[str, Any]:
         "tre_mm": 1e3 * float(errors.mean()),
         "moved_mm": 1e3 * float(np.linalg.norm(truth - rest, axis=1).mean()),
         "held": float((errors <= known.margin()).mean()),
+        "force_off": float(np.linalg.norm(off) / np.linalg.norm(force)),
+        "z2": float(off @ np.linalg.solve(result.net_force_covariance, off) / 3.0),
         "covered": covered(errors, known, SHARES),
         "seconds": result.seconds,
         "model_doubt": result.discrepancy_scale,
@@ -141,8 +144,9 @@ def rows_of(name: str, registrars: dict[str, Any], body: Body, draws: int) -> li
             for draw in range(draws if ROWS[name] is not clean else 1):
                 cloud = ROWS[name](data.clouds[frame], body, np.random.default_rng([draw, frame]))
                 told = {"sequence": s, "frame": frame, "draw": draw}
+                true = data.positions[frame], data.net_forces[frame]
                 try:
-                    rows.append({**told, **judged(registrar.register(cloud), body.points, data.positions[frame])})
+                    rows.append({**told, **judged(registrar.register(cloud), body.points, *true)})
                 except NotConverged as error:
                     rows.append({**told, "failed": str(error)})
     return rows
