@@ -47,7 +47,7 @@ _WAVES = 300
 ENGINES: dict[str, dict[str, Any]] = {
     "surrogate": {"model": "surrogate", "pose": "fixed"},
     "hybrid": {"model": "hybrid", "pose": "fixed"},
-    "hybrid, ratio unknown": {"model": "hybrid", "unknowns": ["poisson-ratio"], "pose": "fixed"},
+    "hybrid, ratio unknown": {"model": "hybrid", "parameters": ["poisson-ratio"], "pose": "fixed"},
     "linear reference": {"model": "reference", "pose": "fixed"},
     "surrogate, pose to 2 mm": {"model": "surrogate"},
     "hybrid, pose to 2 mm": {"model": "hybrid"},
