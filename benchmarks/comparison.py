@@ -420,7 +420,7 @@ class RowFinding:
         if self.is_missing:
             return "MISSING"
         worse = ", ".join(finding.figure for finding in self.findings if finding.fails)
-        better = ", ".join(finding.figure for finding in self.findings if finding.word == "better")
+        better = ", ".join(each.figure for each in self.findings if each.word == "better" and each.is_guarded)
         told = "; ".join(filter(None, (f"WORSE: {worse}" if worse else "", f"better: {better}" if better else "")))
         return told or "holds"
 

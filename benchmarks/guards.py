@@ -204,7 +204,6 @@ def calibrated(name: str) -> Guard:
     is_beam = name.startswith("beam")
 
     def cases(given: Given) -> list[Case]:
-        given.once(beam_network, given)
         one = calibration.CASES[name](given.twin, given.ranks)
         rows, _ = calibration.rows_of(one, so_many(given, 200 if is_beam else 120))
         return [

@@ -127,6 +127,7 @@ def test_what_is_hard_may_not_be_refused_to_look_better() -> None:
 def test_slower_and_less_accepted_is_said_and_does_not_fail() -> None:
     new = [replace(case, seconds=0.2, verdict="doubtful") for case in cases()]
     found = only(cases(), new)
+    assert found.verdict == only(new, cases()).verdict == "holds"
     assert not found.fails and {f.figure for f in found.findings if f.word == "worse"} == {"accepted", "seconds"}
 
 
