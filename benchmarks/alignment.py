@@ -79,7 +79,7 @@ def timed(surface: Surface, cloud: Floats) -> tuple[Alignment, float, float]:
 def of_liver(surface: Surface, views: list[View], clouds: list[Floats]) -> dict[str, Any]:
     """Shares over views whose true pose is known."""
     runs = [timed(surface, cloud) for cloud in clouds]
-    errors = np.array([a.pose.distance_to(v.pose, v.positions) for (a, *_), v in zip(runs, views, strict=True)])
+    errors = np.array([off(a, v) for (a, *_), v in zip(runs, views, strict=True)])
     matched = np.array([v.matched.distance_to(v.pose, v.positions) for v in views])
     found = np.array([alignment.is_found for alignment, *_ in runs])
     return {
@@ -99,6 +99,11 @@ def of_liver(surface: Surface, views: list[View], clouds: list[Floats]) -> dict[
     }
 
 
+def off(found: Alignment, of: View) -> float:
+    """Mean distance of the true node positions between the pose found and the true one, metres."""
+    return found.pose.distance_to(of.pose, of.positions)
+
+
 def outcomes(alignments: list[Alignment]) -> dict[str, int]:
     """How often each outcome came."""
     return {outcome.value: sum(a.outcome is outcome for a in alignments) for outcome in AlignmentOutcome}
@@ -111,12 +116,17 @@ def impossible(draw: Callable[[np.random.Generator], Floats], surface: Surface, 
 
 
 def of_share(kind: str, share: float, draws: int, wild: int) -> dict[str, Any]:
-    """Views of the organ that show a share of it, as they are or with outliers."""
-    views = [seen(share, np.random.default_rng([1, i])) for i in range(draws if kind == "liver" else min(draws, wild))]
+    """What is found of views of the organ that show a share of it, as they are or with outliers."""
+    return of_liver(organ().boundary_surface, *views_of(kind, share, draws if kind == "liver" else min(draws, wild)))
+
+
+def views_of(kind: str, share: float, draws: int) -> tuple[list[View], list[Floats]]:
+    """Views of the organ that show a share of it, and their clouds, as they are or with outliers."""
+    views = [seen(share, np.random.default_rng([1, i])) for i in range(draws)]
     clouds = [v.cloud for v in views]
     if kind == "outliers":
         clouds = [with_outliers(cloud, np.random.default_rng([2, i])) for i, cloud in enumerate(clouds)]
-    return of_liver(organ().boundary_surface, views, clouds)
+    return views, clouds
 
 
 organ, phantom = cache(liver), cache(liver_phantom)

@@ -45,6 +45,7 @@ from softtwin.registration.options import expected_force, options_for
 from softtwin.registration.problem import Problem as Search
 from softtwin.registration.registrar import prepare
 from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.result import Registration
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.model import Surrogate
@@ -190,6 +191,7 @@ class Answer:
         iterations: of it.
         seconds: that it took, without what is prepared before a cloud comes.
         verdict: in words; empty for a way that gives none.
+        registration: with its doubt; None for a way that gives none.
     """
 
     displacement: Floats
@@ -198,6 +200,7 @@ class Answer:
     iterations: int
     seconds: float
     verdict: str = ""
+    registration: Registration | None = None
 
 
 Way = Callable[[Case], Answer]
@@ -225,6 +228,7 @@ def ours(network: ForwardModel, is_known: bool) -> Way:
             len(found.trace),
             seconds,
             found.judgement.verdict.value,
+            found,
         )
 
     return run
@@ -293,13 +297,19 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def judged(way: Way, given: Case, elastic: ElasticBody | None) -> dict[str, Any]:
+def answered(way: Way, given: Case) -> Answer | str:
+    """What a way makes of a case, or why it makes nothing of it."""
+    try:
+        return way(given)
+    except (NotConverged, ValueError) as error:
+        return str(error)
+
+
+def judged(found: Answer | str, given: Case, elastic: ElasticBody | None) -> dict[str, Any]:
     """One case by one way."""
     row: dict[str, Any] = {"number": given.number, "kind": given.kind, "failure": None}
-    try:
-        found = way(given)
-    except (NotConverged, ValueError) as error:
-        return {**row, "failure": str(error)}
+    if isinstance(found, str):
+        return {**row, "failure": found}
     row["ms"] = 1e3 * found.seconds
     away = np.linalg.norm(found.displacement - given.truth, axis=1)
     row |= {"mean_m": away.mean(), "largest_m": away.max(), "norm_over_nodes_m": np.linalg.norm(away) / len(away)}
@@ -337,7 +347,8 @@ def work(row: str, given: Given) -> dict[str, Any]:
     few = given.cases if row == next(iter(WAYS)) else given.few
     for place, one in enumerate(tqdm(given.opened(solved, given.ranks, given.cases)[:few], desc=row)):
         with watched(clock):
-            rows.append(judged(way, one, elastic if place < STRESSED else None))
+            found = answered(way, one)
+        rows.append(judged(found, one, elastic if place < STRESSED else None))
     kinds = {kind: figures_of([each for each in rows if each["kind"] == kind]) for kind in KINDS}
     return {**figures_of(rows), "kinds": kinds, "seconds_in": dict(clock.spent)}
 

@@ -133,6 +133,12 @@ def size_told(case: Case, body: Body) -> float:
 
 
 def run_cases(case: Case, count: int) -> dict[str, Any]:
+    """What so many cases come to."""
+    rows, told = rows_of(case, count)
+    return {**summary(rows), **told}
+
+
+def rows_of(case: Case, count: int) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """So many cases; a load without a stable equilibrium, or beyond what the network has learned, is drawn again."""
     body = case.network.body
     scale = LogNormalPrior(size_told(case, body), SPREAD, minimum=1e-6)
@@ -165,25 +171,27 @@ def run_cases(case: Case, count: int) -> dict[str, Any]:
                 continue
             rows.append(one(case, registrar, forces, state.displacement, rng))
             bar.update()
-    return {**summary(rows), "drawn_again": again, "force_scale_N": scale.median}
+    return rows, {"drawn_again": again, "force_scale_N": scale.median}
 
 
 def one(case: Case, registrar: Any, forces: Floats, truth: Floats, rng: np.random.Generator) -> dict[str, Any]:
     """Errors and doubt of one registration."""
-    body = case.network.body
+    body, moved = case.network.body, 1e3 * float(np.linalg.norm(truth, axis=1).mean())
     try:
         result = registrar.register(case.seen(truth, rng))
     except (CloudError, NotConverged) as error:
-        return {"verdict": Verdict.REFUSED.value, "failure": str(error)}
+        return {"verdict": Verdict.REFUSED.value, "moved_mm": moved, "failure": str(error)}
     known, missed = result.uncertainty, result.net_force - forces.sum(axis=0)
     errors = np.linalg.norm(result.displacement - truth, axis=1)
     free = np.setdiff1d(np.arange(len(errors)), body.fixed)
     root = np.linalg.cholesky(result.net_force_covariance)
     return {
         "verdict": result.judgement.verdict.value,
+        "moved_mm": moved,
         "error_mm": 1e3 * float(errors.mean()),
         "predicted_mm": predicted_mm(known),
         "covered": [float((errors <= known.margin(None, share))[free].mean()) for share in SHARES],
+        "force_off": float(np.linalg.norm(missed) / np.linalg.norm(forces.sum(axis=0))),
         "z": np.linalg.solve(root, missed).tolist(),
         "ranks": norm.cdf(-missed / result.net_force_deviation).tolist(),
         "seconds": result.seconds,

@@ -21,8 +21,8 @@ from harness import Benchmark, Given, Setting, run
 from liver import SEQUENCES, sequence
 from numpy.typing import NDArray
 from record import RUNS
-from robustness import clean, forward_model, registrar_for, towards_camera
-from summaries import counts
+from robustness import SHARES, clean, forward_model, registrar_for, towards_camera
+from summaries import counts, covered
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.outcome import NotConverged
@@ -85,14 +85,20 @@ ROWS: dict[str, Moved] = {
 }
 
 
-def judged(result: Registration, rest: Floats, truth: Floats) -> dict[str, Any]:
+def judged(result: Registration, rest: Floats, truth: Floats, force: Floats) -> dict[str, Any]:
     """Errors and doubt of one frame."""
-    errors = np.linalg.norm(rest + result.displacement - truth, axis=1)
+    off = result.net_force - force
+    errors, known = np.linalg.norm(rest + result.displacement - truth, axis=1), result.uncertainty
     reasons = result.judgement.reasons
     return {
         "verdict": result.judgement.verdict.value,
         "tre_mm": 1e3 * float(errors.mean()),
-        "held": float((errors <= result.uncertainty.margin()).mean()),
+        "moved_mm": 1e3 * float(np.linalg.norm(truth - rest, axis=1).mean()),
+        "held": float((errors <= known.margin()).mean()),
+        "force_off": float(np.linalg.norm(off) / np.linalg.norm(force)),
+        "z2": float(off @ np.linalg.solve(result.net_force_covariance, off) / 3.0),
+        "covered": covered(errors, known, SHARES),
+        "seconds": result.seconds,
         "model_doubt": result.discrepancy_scale,
         "outliers": result.outliers,
         "by_error": len(reasons) == 1 and "seen to get wrong" in reasons[0],
@@ -123,18 +129,27 @@ def summary(rows: list[dict[str, Any]], failed: int) -> dict[str, Any]:
 
 
 def row_of(name: str, registrars: dict[str, Any], body: Body, draws: int) -> dict[str, Any]:
-    """All frames of one kind of cloud."""
-    rows, failed = list[dict[str, Any]](), 0
+    """What all frames of one kind of cloud come to."""
+    rows = rows_of(name, registrars, body, draws)
+    done = [row for row in rows if "failed" not in row]
+    return summary(done, len(rows) - len(done))
+
+
+def rows_of(name: str, registrars: dict[str, Any], body: Body, draws: int) -> list[dict[str, Any]]:
+    """All frames of one kind of cloud; one without a state says why."""
+    rows = list[dict[str, Any]]()
     for s, registrar in registrars.items():
         data = sequence(s)
         for frame in FRAMES:
             for draw in range(draws if ROWS[name] is not clean else 1):
                 cloud = ROWS[name](data.clouds[frame], body, np.random.default_rng([draw, frame]))
+                told = {"sequence": s, "frame": frame, "draw": draw}
+                true = data.positions[frame], data.net_forces[frame]
                 try:
-                    rows.append(judged(registrar.register(cloud), body.points, data.positions[frame]))
-                except NotConverged:
-                    failed += 1
-    return summary(rows, failed)
+                    rows.append({**told, **judged(registrar.register(cloud), body.points, *true)})
+                except NotConverged as error:
+                    rows.append({**told, "failed": str(error)})
+    return rows
 
 
 def work(row: str, given: Given) -> dict[str, Any]:

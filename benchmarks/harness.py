@@ -235,12 +235,15 @@ def _all_rows(benchmark: Benchmark, name: str, options: argparse.Namespace, comm
             clock = time.perf_counter()
             found = _as_json(benchmark.work(row, given))
             seconds = time.perf_counter() - clock
-            figures = _with(benchmark, figures, row, found)
             print(f"{label}: {seconds:.1f} s; {_line(benchmark, row, found)}", flush=True)
-            if benchmark.finish is not None:
-                figures |= _as_json(benchmark.finish(figures, given))
-            if begun:
-                record.check_unchanged(begun, [*benchmark.about, "benchmarks"])
+            if not begun:
+                figures = _entered(benchmark, figures, row, found, given)
+                continue
+            record.check_unchanged(begun, [*benchmark.about, "benchmarks"])
+            with record.held():  # another process may be at other rows of the same record
+                known = record.read(name)
+                figures = _entered(benchmark, known.get("figures", {}), row, found, given)
+                made = record.made_of(known, benchmark.under) if known else {}
                 made[row] = _made(benchmark, begun, command, seconds, kept)
                 made = record.made_of({**known, "figures": figures, "made": made}, benchmark.under)
                 record.write(name, figures, made, command, begun)
@@ -284,6 +287,12 @@ def _with(benchmark: Benchmark, figures: Figures, row: str, found: Any) -> Figur
         return dict(found)
     benchmark.rows_of(figures)[row] = found
     return figures
+
+
+def _entered(benchmark: Benchmark, figures: Figures, row: str, found: Any, given: Given) -> Figures:
+    """The figures of all rows with those of one more."""
+    figures = _with(benchmark, figures, row, found)
+    return figures if benchmark.finish is None else figures | _as_json(benchmark.finish(figures, given))
 
 
 def _as_json(value: Any) -> Any:

@@ -26,7 +26,7 @@ from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequ
 from numpy.typing import NDArray
 from record import RUNS
 from scipy.stats import chi2
-from summaries import counts, predicted_mm
+from summaries import counts, covered, predicted_mm
 from threadpoolctl import threadpool_limits
 
 from softtwin.meshes.body import Body
@@ -178,11 +178,12 @@ def figures(
     found = {
         "sequence": data.name,
         "frame": frame,
+        "moved_mm": 1e3 * float(np.linalg.norm(data.positions[frame] - rest, axis=1).mean()),
         "tre_mm": 1e3 * float(errors.mean()),
         "predicted_mm": predicted_mm(known),
         "force_error": float(np.linalg.norm(missed)) / size if size > 0.0 else None,
         "z2": float(missed @ np.linalg.solve(result.net_force_covariance, missed) / 3.0),
-        "covered": {str(share): float((errors <= known.margin(carrier, share) + 1e-12).mean()) for share in SHARES},
+        "covered": covered(errors, known, SHARES, carrier),
         "seconds": result.seconds,
         "iterations": len(result.trace),
         "verdict": result.judgement.verdict.value,

@@ -47,7 +47,7 @@ _WAVES = 300
 ENGINES: dict[str, dict[str, Any]] = {
     "surrogate": {"model": "surrogate", "pose": "fixed"},
     "hybrid": {"model": "hybrid", "pose": "fixed"},
-    "hybrid, ratio unknown": {"model": "hybrid", "unknowns": ["poisson-ratio"], "pose": "fixed"},
+    "hybrid, ratio unknown": {"model": "hybrid", "parameters": ["poisson-ratio"], "pose": "fixed"},
     "linear reference": {"model": "reference", "pose": "fixed"},
     "surrogate, pose to 2 mm": {"model": "surrogate"},
     "hybrid, pose to 2 mm": {"model": "hybrid"},
@@ -171,6 +171,7 @@ def one(twin: Any, truth: Floats, net: Floats, cloud: Floats) -> dict[str, Any]:
     }
     return {
         "verdict": result.judgement.verdict.value,
+        "moved_mm": 1e3 * float(np.linalg.norm(truth, axis=1).mean()),
         "error_mm": 1e3 * float(lengths.mean()),
         "predicted_mm": 1e3 * float(known.deviation.mean()),
         "nodes": {share: float((lengths <= known.margin(None, share) + 1e-12).mean()) for share in SHARES},
@@ -206,8 +207,10 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def measured(folder: Path, engine: str, states: list[tuple[Floats, Floats, Floats]], doubt: bool) -> dict[str, Any]:
-    """One row."""
+def registered(
+    folder: Path, engine: str, states: list[tuple[Floats, Floats, Floats]], doubt: bool
+) -> list[dict[str, Any]]:
+    """Errors and doubt of each state."""
     home = find_twin(folder)
     material = home.config.material.model_copy(
         update={"young_modulus_deviation": 0.3, **({"law": "linear-elastic"} if engine == _LINEAR else {})}
@@ -218,7 +221,7 @@ def measured(folder: Path, engine: str, states: list[tuple[Floats, Floats, Float
             (place / MODEL_ERROR).unlink(missing_ok=True)
         home = type(home)(place, home.body, home.config.model_copy(update={"material": material}))
         with home.twin(**ENGINES[engine]) as twin:
-            return summary([one(twin, *state) for state in states])
+            return [one(twin, *state) for state in states]
 
 
 ROWS = tuple(f"{e}: {kind}" for kind in KINDS for e in ENGINES if e != _LINEAR or kind == "as it is")
@@ -234,7 +237,7 @@ def work(row: str, given: Given) -> dict[str, Any]:
     if not given.no_doubt and not (find_twin(given.folder).folder / MODEL_ERROR).is_file():
         raise SystemExit(f"{given.folder}: expected what `softtwin doubt` makes, found none; make it, or --no-doubt")
     states = given.once(states_of, given.folder, kind, given.truths)
-    return measured(given.folder, engine, states, not given.no_doubt)
+    return summary(registered(given.folder, engine, states, not given.no_doubt))
 
 
 BENCHMARK = Benchmark(

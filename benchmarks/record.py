@@ -8,12 +8,15 @@ record's own commit, with `-dirty` where the tree had uncommitted changes, or no
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import platform
+import re
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -153,9 +156,37 @@ def write(name: str, figures: Any, made: dict[str, Any], command: str, begun: st
     told = {"benchmark": name, "date": time.strftime("%Y-%m-%d"), "command": command, "commit": begun}
     record = {**told, "machine": machine(), "figures": figures, "made": made}
     partly = path.with_suffix(".part")
-    partly.write_text(json.dumps(record, indent=1, default=plain) + "\n")
+    partly.write_text(as_text(record) + "\n")
     partly.replace(path)
     return path
+
+
+def as_text(record: Any) -> str:
+    """JSON of a record; each of a row's `cases`, of which there are thousands, on one line."""
+    lines: list[str] = []
+
+    def packed(value: Any, name: str = "") -> Any:
+        if isinstance(value, dict):
+            return {key: packed(each, key) for key, each in value.items()}
+        if name == "cases" and isinstance(value, list):
+            lines.extend(json.dumps(each, default=plain) for each in value)
+            return [f"\0{number}" for number in range(len(lines) - len(value), len(lines))]
+        return value
+
+    text = json.dumps(packed(record), indent=1, default=plain)
+    return re.sub(r'"\\u0000(\d+)"', lambda found: lines[int(found[1])], text)
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """The records for this process alone, while it adds a row to one that others add rows to."""
+    RESULTS.mkdir(exist_ok=True)
+    folder = os.open(RESULTS, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)
 
 
 def plain(value: Any) -> Any:

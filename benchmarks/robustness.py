@@ -21,6 +21,7 @@ from harness import Benchmark, Given, Setting, run
 from liver import POISSON_RATIO, SEQUENCES, YOUNG_MODULUS, Sequence, liver, sequence
 from numpy.typing import NDArray
 from record import RUNS
+from summaries import covered
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
@@ -36,6 +37,7 @@ from softtwin.registration.result import Registration
 Floats = NDArray[np.float64]
 Generator = np.random.Generator
 NONSENSE = "nonsense"
+SHARES = (0.9, 0.95)
 
 
 def noisy(millimetres: float) -> Callable[[Floats, Body, Generator], Floats]:
@@ -171,6 +173,7 @@ def figures(result: Registration, pose: Pose, data: Sequence, frame: int, rest: 
         "tre_nothing_mm": nothing,
         "force_error": float(np.linalg.norm(missed) / np.linalg.norm(data.net_forces[frame])),
         "z2": float(missed @ np.linalg.solve(covariance, missed) / 3.0),
+        "covered": covered(1e-3 * errors, result.camera_uncertainty, SHARES),
         "noise_mm": 1e3 * result.noise,
         "seconds": result.seconds,
         "iterations": len(result.trace),
@@ -201,7 +204,7 @@ def run_row(name: str, model: ForwardModel, draws: int, frames: int) -> list[dic
                     try:
                         result = registrar.register(cloud, last if start == "warm" else None)
                     except NotConverged as error:
-                        rows.append({"sequence": s, "frame": frame, "start": start, "failed": str(error)})
+                        rows.append({"sequence": s, "frame": frame, "draw": draw, "start": start, "failed": str(error)})
                         continue
                     rows.append({**figures(result, pose, data, frame, body.points, start), "draw": draw})
                     if start == "warm" or frame == 0:

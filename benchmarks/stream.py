@@ -39,10 +39,16 @@ def path_of(folder: Path) -> list[Floats]:
     return [(1.0 - share) * a + share * b for a, b in pairs for share in shares]
 
 
+def clouds_of(twin: Twin, path: list[Floats]) -> list[Floats]:
+    """What the camera sees of each state."""
+    rng = np.random.default_rng(0)
+    return [partial_view(twin.body, u, CAMERA, POINTS, NOISE, rng, surface="observed") for u in path]
+
+
 def work(row: str, given: Given) -> dict[str, Any]:
-    path, rng = path_of(given.folder), np.random.default_rng(0)
+    path = path_of(given.folder)
     with Twin.open(given.folder, given.engine, pose="fixed") as twin:
-        clouds = [partial_view(twin.body, u, CAMERA, POINTS, NOISE, rng, surface="observed") for u in path]
+        clouds = clouds_of(twin, path)
         sequence = Sequence(twin, "")
         sequence.register(clouds[0])  # everything is prepared
         begun: list[float] = []

@@ -32,6 +32,11 @@ def resident_mib(process: int | str = "self") -> float:
     return int(status.split("VmRSS:")[1].split()[0]) / 1024
 
 
+def covered(errors: Any, known: Any, shares: Iterable[float], points: Any = None) -> dict[str, float]:
+    """Share of errors that lie within the margin of each confidence; metres, of the nodes if no points are given."""
+    return {str(share): float((errors <= known.margin(points, share) + 1e-12).mean()) for share in shares}
+
+
 def predicted_mm(uncertainty: Any) -> float:
     """Mean error of the nodes that a posterior expects, mm: the mean length of a normal error in space."""
     return 1e3 * float(np.sqrt(8.0 / (3.0 * np.pi)) * uncertainty.deviation.mean())

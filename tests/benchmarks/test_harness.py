@@ -123,6 +123,17 @@ def test_rows_go_on_where_they_stopped(repository: Repository) -> None:
     assert record.recorded("squares_whole")["two"] == {"square": 8.0}
 
 
+def test_rows_that_another_process_made_meanwhile_are_kept(repository: Repository) -> None:
+    class Slow(Counted):
+        def work(self, row: str, given: Given) -> dict[str, Any]:
+            if row == "two":
+                Counted().run("--only", "three")
+            return super().work(row, given)
+
+    assert Slow().run("--only", "two") == ["two"]
+    assert set(record.recorded("squares_whole")) == set(record.read("squares_whole")["made"]) == {"two", "three"}
+
+
 def test_only_takes_names_and_parts_of_names(repository: Repository, capsys: pytest.CaptureFixture[str]) -> None:
     counted = Counted()
     assert counted.run("--dry", "--only", "tw") == ["two", "twenty"]
