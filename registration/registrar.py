@@ -120,9 +120,10 @@ class Registrar:
         self.error = None if discrepancy is None else ModelError.of(discrepancy, observed.nodes)
         # Where it is not known what the model gets wrong, points tell no more than the model can meet.
         self.noise = self.options.noise.with_minimum(model.error)
+        self._told = expectations
         self.expectations = expectations or Expectations.of(model, self.noise)
         self._everywhere = self._prepared(forces)
-        self._fast: tuple[ForwardModel, NodalForces, ReducedModel] | None = None
+        self._fast: list[tuple[ForwardModel, NodalForces, ReducedModel]] = []  # the last, which copies share
 
     def _prepared(self, forces: NodalForces) -> Prepared:
         return Prepared.of(self.model, self.observed, forces, self.parameter_blocks)
@@ -136,6 +137,7 @@ class Registrar:
             self.forces,
             options,
             pose=pose,
+            expectations=self._told,
             parameter_blocks=self.parameter_blocks,
             modulus_deviation=self.modulus_deviation,
             anywhere=None if anywhere is None else lambda: anywhere().with_pose(pose, options),
@@ -370,9 +372,9 @@ class Registrar:
 
     def _reduced(self, fast: ForwardModel, forces: NodalForces) -> ReducedModel:
         """The fast model between this one's forces and the observed nodes; that of the last forces is kept."""
-        if self._fast is None or self._fast[0] is not fast or self._fast[1] is not forces:
-            self._fast = fast, forces, reduce_model(fast, self.observed.nodes, forces.basis)
-        return self._fast[2]
+        if not self._fast or self._fast[0][0] is not fast or self._fast[0][1] is not forces:
+            self._fast[:] = [(fast, forces, reduce_model(fast, self.observed.nodes, forces.basis))]
+        return self._fast[0][2]
 
     def follow(self, cloud: ArrayLike, last: Registration | None) -> Registration:
         """The next frame of a sequence: from the last one, and from rest where that is not accepted.

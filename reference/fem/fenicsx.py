@@ -9,6 +9,7 @@ import contextlib
 import fcntl
 import hashlib
 import inspect
+import itertools
 import logging
 import os
 import platform
@@ -40,6 +41,14 @@ from softtwin.meshes.elements import Kind
 from softtwin.meshes.signals import restore_sigpipe
 
 restore_sigpipe()  # PETSc took it where somebody imported DOLFINx before
+
+# UFL orders the terms of sums and products by the text of their constants, numbers in it: "10" comes before "9". With
+# numbers of one length a form is the same, and compiled once, however many constants there were before it.
+_FIRST_CONSTANT = 10**9
+if hasattr(ufl.Constant, "_globalcount"):  # 0.5.2
+    ufl.Constant._globalcount = max(ufl.Constant._globalcount, _FIRST_CONSTANT)
+else:
+    ufl.Constant._counter = itertools.count(_FIRST_CONSTANT)
 
 if warnings.showwarning is not _SHOWN:  # FFCx 0.5 turns all of Python's warnings into lines of its log
     logging.captureWarnings(False)

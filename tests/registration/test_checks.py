@@ -11,9 +11,10 @@ import pytest
 from scipy.stats import norm
 
 from softtwin.meshes.body import Body
-from softtwin.registration.checks import _check, _largest_normal, _log_normal
+from softtwin.registration.checks import Expectations, _check, _largest_normal, _log_normal
 from softtwin.registration.hyperparameters import LogNormalPrior
-from softtwin.registration.priors import nodal_forces
+from softtwin.registration.pose import Pose
+from softtwin.registration.priors import PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.result import Registration
@@ -107,3 +108,14 @@ def test_chances_are_those_of_draws(rng: np.random.Generator) -> None:
 def test_the_guide_names_every_check() -> None:
     table = GUIDE[GUIDE.index("|check|looks at|") : GUIDE.index("An accepted frame can still be wrong")]
     assert set(re.findall(r"^\|`(\w+)`", table, flags=re.M)) == {code.value for code in Code}
+
+
+def test_expectations_that_were_given_stay_with_a_pose(body: Body, found: Registration) -> None:
+    strict = Expectations(noise=1e-3, systematic=1e-3, movement=0.01)
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 2.0, minimum=1e-4))
+    observed = SurfaceDistance(body, body.surfaces["observed"])
+    made = Registrar(Cantilever(body, learned=2.0), observed, forces, expectations=strict)
+    camera = PosePrior(Pose.identity(), body.points.mean(axis=0), 0.1, 0.01)
+    assert made.with_pose(camera, made.options).expectations is strict
+    usual = Registrar(made.model, observed, forces)
+    assert usual.with_pose(camera, usual.options).expectations == usual.expectations
