@@ -23,6 +23,7 @@ from .identifiability import uninformed
 from .loss import REJECTED
 from .outcome import Outcome
 from .problem import Problem
+from .score import Score, by_rigid_motion, by_scale, score
 from .verdict import Check, Code, Judgement, Verdict
 
 Floats = NDArray[np.float64]
@@ -35,6 +36,8 @@ _MUCH, _THIN, _ABOUT = 0.2, 0.05, 8  # share of the points that fit nowhere, thi
 # Turn (radians) or stretch that a linear law holds for, half of which it is off by, relative: a centimetre of movement
 # is then good to a camera's noise. Per cent of the cells.
 _SMALL, _NEARLY_ALL = 0.03, 95.0
+_UNLIKELY = 2.0 * float(norm.sf(3.0))  # chance of a score: that of three standard deviations
+_SCALE_OFF = 0.005  # of the cloud's scale: half a millimetre in ten centimetres harms nobody
 _LINE = 0.02  # of a cloud's width to its length: a narrower one shows no surface
 _REFUSED_NOISE, _REFUSED_PATCHES, _REFUSED_LOAD = 1.5, 2.0, 2.0  # times the level: no use at all
 
@@ -92,7 +95,12 @@ class Expectations:
 
 
 def judge(
-    problem: Problem, found: SolverResult, state: State, expected: Expectations, discrepancy_scale: float = 1.0
+    problem: Problem,
+    found: SolverResult,
+    state: State,
+    expected: Expectations,
+    discrepancy_scale: float = 1.0,
+    inflation_factor: float = 1.0,
 ) -> Judgement:
     """The verdict on a solver's result.
 
@@ -102,6 +110,7 @@ def judge(
         state: the body's state there.
         expected: what a usable result looks like.
         discrepancy_scale: how large the model's error was found, in units of its samples'.
+        inflation_factor: how many correlated residuals count as one.
     """
     checks = (
         _convergence(found),
@@ -110,6 +119,7 @@ def judge(
         *_state(problem, state, expected),
         *_discrepancy(problem, found, expected, discrepancy_scale),
         *_pose(problem, found, expected),
+        *_left_out(problem, found, inflation_factor),
         *_parameters(problem, found, expected),
         *_landmarks(problem, found),
         *_normals(problem, found),
@@ -304,6 +314,38 @@ def _largest_normal(value: float, count: int) -> tuple[str, float]:
     """The chance of so large a deviation, the largest of several by its prior."""
     chance = _of_several(2.0 * float(norm.sf(value)), count)
     return f"largest of {count} standard normal deviations" if count > 1 else "standard normal", chance
+
+
+def _left_out(problem: Problem, found: SolverResult, inflation_factor: float) -> Iterator[Check]:
+    """What is no unknown here, and would explain the cloud better: its scale, and a pose that was given as exact."""
+    told = score(found.local, by_scale(found.local), inflation_factor)
+    if told is not None:
+        size = float(np.expm1(told.estimate[0]))
+        matters = abs(told.estimate[0]) > _SCALE_OFF
+        odd = (
+            f"the cloud fits better {100 * abs(size):.1f} % {'smaller' if size > 0.0 else 'larger'}: look at its unit "
+            "and the camera's calibration"
+        )
+        yield _scored(Code.SCALE, told, matters, odd)
+    if problem.pose is not None:
+        return
+    told = score(found.local, by_rigid_motion(found.local), inflation_factor)
+    if told is not None:
+        turn, shift = (float(np.linalg.norm(part)) for part in np.split(told.estimate, 2))
+        matters = max(turn * problem.observed.body.size / 2.0, shift) > problem.noise.median
+        odd = (
+            f"the cloud fits better turned by {np.rad2deg(turn):.1f} degrees and shifted by {1e3 * shift:.1f} mm: the "
+            "pose is not exact; say --pose unknown"
+        )
+        yield _scored(Code.EXACT_POSE, told, matters, odd)
+
+
+def _scored(code: Code, told: Score, matters: bool, reason: str) -> Check:
+    """A check by a score test; what is sure and too small to matter is passed."""
+    level = float(chi2.isf(_UNLIKELY, len(told.estimate)))
+    law = f"chi-square, {len(told.estimate)} degrees of freedom", told.p_value
+    made = _check(code, told.statistic, level, reason, law=law)
+    return made if matters else replace(made, verdict=Verdict.ACCEPTED, level=None, reason="")
 
 
 def _of_several(chance: float, count: int) -> float:

@@ -395,11 +395,16 @@ class LocalModel:
         return None
 
     def _whole_for(self, gradient: Floats) -> Floats:
-        root = 1.0 / np.sqrt(self.precision)
+        return -self.solved(gradient[:, None])[:, 0]
+
+    def solved(self, right: Floats) -> Floats:
+        """The inverse of the Hessian, the posterior's precision, times columns, (k, m)."""
+        root = 1.0 / np.sqrt(self.precision)[:, None]
         if self._factor is not None:
-            return -root * cho_solve(self._factor, root * gradient, check_finite=False)
+            found: Floats = root * cho_solve(self._factor, root * right, check_finite=False)
+            return found
         values, vectors = self._eigen  # with the prior none is below 1, whatever round-off says
-        return -root * (vectors @ (vectors.T @ (root * gradient) / np.maximum(values, 1.0)))
+        return np.asarray(root * (vectors @ (vectors.T @ (root * right) / np.maximum(values, 1.0)[:, None])))
 
     @cached_property
     def _whole(self) -> Floats:

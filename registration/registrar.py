@@ -606,7 +606,7 @@ class Registrar:
             informed=found.posterior.informed,
             points=len(problem.cloud),
             outcome=found.outcome,
-            judgement=judge(problem, found, state, self.expectations, discrepancy_scale),
+            judgement=judge(problem, found, state, self.expectations, discrepancy_scale, inflation_factor),
             evaluations=found.evaluations,
             seconds=time.perf_counter() - begin,
             trace=found.trace,

@@ -32,6 +32,8 @@ class Code(Enum):
     STABILITY = "stability"
     DISCREPANCY_SCALE = "discrepancy_scale"
     POSE = "pose"
+    EXACT_POSE = "exact_pose"
+    SCALE = "scale"
     PARAMETER = "parameter"
     IDENTIFIABILITY = "identifiability"
     LANDMARKS = "landmarks"
