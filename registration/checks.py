@@ -320,12 +320,8 @@ def _left_out(problem: Problem, found: SolverResult, inflation_factor: float) ->
     """What is no unknown here, and would explain the cloud better: its scale, and a pose that was given as exact."""
     told = score(found.local, by_scale(found.local), inflation_factor)
     if told is not None:
-        size = float(np.expm1(told.estimate[0]))
-        matters = abs(told.estimate[0]) > _SCALE_OFF
-        odd = (
-            f"the cloud fits better {100 * abs(size):.1f} % {'smaller' if size > 0.0 else 'larger'}: look at its unit "
-            "and the camera's calibration"
-        )
+        matters = abs(told.estimate[0]) > _SCALE_OFF  # its sign is not said: far off, what is taken for noise turns it
+        odd = "the cloud would fit better at another scale: look at its unit and at the camera's calibration"
         yield _scored(Code.SCALE, told, matters, odd)
     if problem.pose is not None:
         return

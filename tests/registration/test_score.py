@@ -1,0 +1,99 @@
+"""Score tests: chi-square where nothing was left out, and far beyond where the cloud is scaled or its pose is wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from softtwin.meshes.body import Body
+from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.priors import nodal_forces
+from softtwin.registration.registrar import Registrar
+from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.score import by_rigid_motion, by_scale, score
+from softtwin.registration.verdict import Code, Verdict
+
+from .conftest import Cantilever, cloud_on, tip_forces
+
+NOISE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def registrar(body: Body) -> Registrar:
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 2.0, minimum=1e-4))
+    return Registrar(Cantilever(body, learned=2.0), SurfaceDistance(body, body.surfaces["observed"]), forces)
+
+
+def some_cloud(registrar: Registrar, seed: int) -> np.ndarray:
+    rng, body = np.random.default_rng([5, seed]), registrar.model.body
+    truth = registrar.model.solve(tip_forces(body, (0.0, *rng.uniform(-0.8, 0.8, 2)))).displacement
+    return cloud_on(body, truth, 400, rng, NOISE)
+
+
+def about_its_middle(cloud: np.ndarray, turn: float = 0.0, shift: float = 0.0, scale: float = 1.0) -> np.ndarray:
+    middle = cloud.mean(axis=0)
+    rotation = Rotation.from_rotvec([0.0, turn, 0.0]).as_matrix()
+    return middle + scale * (cloud - middle) @ rotation.T + shift * np.array([0.0, 1.0, 0.0])
+
+
+def test_of_a_right_model_chances_are_no_smaller_than_they_say(registrar: Registrar) -> None:
+    """Of 100 clouds: robust weights make them larger; no more than 10 are below 5 %, and hardly a cloud is doubted."""
+    tested, doubted = {"scale": list[float](), "motion": list[float]()}, 0
+    for seed in range(100):
+        found = registrar.register(some_cloud(registrar, seed))
+        doubted += found.judgement.verdict is not Verdict.ACCEPTED
+        for name, columns in (("scale", by_scale), ("motion", by_rigid_motion)):
+            told = score(found.local, columns(found.local), found.inflation_factor)
+            assert told is not None
+            tested[name].append(told.p_value)
+    assert doubted <= 3
+    for chances in tested.values():
+        assert np.mean(np.less(chances, 0.05)) <= 0.1 and 0.4 < np.median(chances) < 0.9
+
+
+@pytest.mark.parametrize("scale", [0.93, 1.05])
+def test_a_scale_is_named(registrar: Registrar, scale: float) -> None:
+    found = registrar.register(about_its_middle(some_cloud(registrar, 1), scale=scale))
+    (check,) = (check for check in found.judgement.checks if check.code is Code.SCALE)
+    assert check.verdict is Verdict.DOUBTFUL and "at another scale" in check.reason
+    assert check.p_value is not None and check.p_value < 1e-3
+
+
+def test_a_pose_that_is_not_exact_is_named(registrar: Registrar) -> None:
+    found = registrar.register(about_its_middle(some_cloud(registrar, 2), turn=0.04, shift=3e-3))
+    (check,) = (check for check in found.judgement.checks if check.code is Code.EXACT_POSE)
+    assert check.verdict is Verdict.DOUBTFUL and "the pose is not exact" in check.reason
+
+
+def test_what_is_sure_and_too_small_to_matter_is_passed(registrar: Registrar) -> None:
+    """A tenth of a per cent, with next to no noise."""
+    body = registrar.model.body
+    truth = registrar.model.solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
+    exact = about_its_middle(cloud_on(body, truth, 400, np.random.default_rng(0), 1e-5), scale=1.002)
+    judged = registrar.register(exact).judgement
+    (check,) = (check for check in judged.checks if check.code is Code.SCALE)
+    assert check.is_passed and not check.reason
+
+
+def test_columns_are_derivatives_of_the_distances(registrar: Registrar) -> None:
+    """By differences, where the closest point is within a triangle."""
+    local = registrar.register(some_cloud(registrar, 0)).local
+    assert local is not None
+    at, observed, step = local.evaluation, local.problem.observed, 1e-6
+    middle = at.cloud[local.weights > 0.0].mean(axis=0)
+    before = observed.match(at.positions, at.cloud).distances
+    turned = Rotation.from_rotvec([0.0, step, 0.0]).as_matrix()
+    moved = {
+        "scale": (middle + (1.0 + step) * (at.cloud - middle), by_scale(local)[:, 0]),
+        "turn": (middle + (at.cloud - middle) @ turned.T, by_rigid_motion(local)[:, 1]),
+        "shift": (at.cloud + np.array([0.0, 0.0, step]), by_rigid_motion(local)[:, 5]),
+    }
+    for cloud, column in moved.values():
+        slopes = (observed.match(at.positions, cloud).distances - before) / step
+        assert np.median(np.abs(slopes - column)) < 1e-5 and np.corrcoef(slopes, column)[0, 1] > 0.99
+
+
+def test_nothing_is_said_of_what_is_not_seen(registrar: Registrar) -> None:
+    local = registrar.register(some_cloud(registrar, 3)).local
+    assert local is not None and score(local, np.zeros((400, 1))) is None
