@@ -16,7 +16,7 @@ from softtwin.registration.verdict import Code, Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
 
-NOISE = 1e-3
+NOISE = 4e-4
 
 
 @pytest.fixture(scope="module")
