@@ -61,7 +61,12 @@ def score(local: LocalModel, columns: Floats, inflation_factor: float = 1.0) -> 
 
 
 def by_scale(local: LocalModel) -> Floats:
-    """Derivative of the distances by the logarithm of the cloud's scale about its middle, (p, 1), metres."""
+    """Derivative of the distances by the logarithm of the cloud's scale about its middle, (p, 1), metres.
+
+    Noise across a curved or coarse surface looks like a larger cloud: on right clouds the score's mean was 0.5 standard
+    deviations at 0.5 mm, 2.8 at 2 mm, 5.5 at 5 mm (a phantom), and 6 on a bar of few cells. Its law has to be drawn
+    before a verdict can be based on it.
+    """
     match, arms = local.evaluation.match, _arms(local)
     return -np.einsum("pi,pi->p", match.directions, arms)[:, None]
 
