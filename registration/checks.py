@@ -36,7 +36,9 @@ _MUCH, _THIN, _ABOUT = 0.2, 0.05, 8  # share of the points that fit nowhere, thi
 # Turn (radians) or stretch that a linear law holds for, half of which it is off by, relative: a centimetre of movement
 # is then good to a camera's noise. Per cent of the cells.
 _SMALL, _NEARLY_ALL = 0.03, 95.0
-_UNLIKELY = 2.0 * float(norm.sf(3.0))  # chance of a score: that of three standard deviations
+# Chance of a score: forces that are gathered where the same cloud shows them leave larger ones than their law has, 6 of
+# 114 right clouds beyond three standard deviations (robustness: no zone, noise 1 mm).
+_UNLIKELY = 1e-5
 _LINE = 0.02  # of a cloud's width to its length: a narrower one shows no surface
 _REFUSED_NOISE, _REFUSED_PATCHES, _REFUSED_LOAD = 1.5, 2.0, 2.0  # times the level: no use at all
 

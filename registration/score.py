@@ -2,8 +2,9 @@
 
 With distances y = J theta + c a + noise about the state, all unknowns theta are integrated out with what is believed of
 them; of a the estimate is (c' V c)^-1 c' V y with V = (C + J P^-1 J')^-1, and its square in that metric is chi-square
-where a is zero (Rao 1948). By Woodbury's formula V y are the weighted residuals that the registration has left. Robust weights make the statistic smaller: on
-right models its mean was two thirds of chi-square's (tests/registration/test_score.py), so chances are upper bounds.
+where a is zero (Rao 1948). By Woodbury's formula V y are the weighted residuals that the registration has left. Robust
+weights make the statistic smaller: on right models its mean was two thirds of chi-square's
+(tests/registration/test_score.py), so chances are upper bounds there.
 """
 
 from __future__ import annotations
