@@ -36,8 +36,8 @@ _MUCH, _THIN, _ABOUT = 0.2, 0.05, 8  # share of the points that fit nowhere, thi
 # Turn (radians) or stretch that a linear law holds for, half of which it is off by, relative: a centimetre of movement
 # is then good to a camera's noise. Per cent of the cells.
 _SMALL, _NEARLY_ALL = 0.03, 95.0
-# Chance of a score: forces that are gathered where the same cloud shows them leave larger ones than their law has, 6 of
-# 114 right clouds beyond three standard deviations (robustness: no zone, noise 1 mm).
+# Chance of a score, a choice: forces that are localised by the cloud that they explain leave larger scores than
+# chi-square has. It is far below that of the other checks.
 _UNLIKELY = 1e-5
 _LINE = 0.02  # of a cloud's width to its length: a narrower one shows no surface
 _REFUSED_NOISE, _REFUSED_PATCHES, _REFUSED_LOAD = 1.5, 2.0, 2.0  # times the level: no use at all

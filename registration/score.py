@@ -3,8 +3,7 @@
 With distances y = J theta + c a + noise about the state, all unknowns theta are integrated out with what is believed of
 them; of a the estimate is (c' V c)^-1 c' V y with V = (C + J P^-1 J')^-1, and its square in that metric is chi-square
 where a is zero (Rao 1948). By Woodbury's formula V y are the weighted residuals that the registration has left. Robust
-weights make the statistic smaller: on right models its mean was two thirds of chi-square's
-(tests/registration/test_score.py), so chances are upper bounds there.
+weights make the statistic smaller where the model is right, so that chances are upper bounds there.
 """
 
 from __future__ import annotations
@@ -64,9 +63,8 @@ def score(local: LocalModel, columns: Floats, inflation_factor: float = 1.0) -> 
 def by_scale(local: LocalModel) -> Floats:
     """Derivative of the distances by the logarithm of the cloud's scale about its middle, (p, 1), metres.
 
-    Noise across a curved or coarse surface looks like a larger cloud: on right clouds the score's mean was 0.5 standard
-    deviations at 0.5 mm, 2.8 at 2 mm, 5.5 at 5 mm (a phantom), and 6 on a bar of few cells. Its law has to be drawn
-    before a verdict can be based on it.
+    Noise across a curved or coarse surface looks like a larger cloud: the score of a right one is not chi-square there.
+    Its law has to be drawn at the state before a verdict can be based on it.
     """
     match, arms = local.evaluation.match, _arms(local)
     return -np.einsum("pi,pi->p", match.directions, arms)[:, None]

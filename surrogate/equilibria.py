@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from softtwin.meshes.body import Body
@@ -121,6 +122,10 @@ class Equilibria:
     ) -> None:
         if precision not in ("double", "single"):
             raise ValueError(f"Equilibria.precision: expected 'double' or 'single', got {precision!r}.")
+        if torch.device(device).type == "cuda" and not torch.cuda.is_available():
+            raise ValueError(
+                f"Equilibria.device: expected a GPU that torch can use, found none (torch {torch.__version__})."
+            )
         self.elastic = ElasticBody(body, material).to(device, getattr(torch, _TYPES[precision]))
         self.dtype, self.device = self.elastic.gradients.dtype, self.elastic.gradients.device
         self.body, self.material, self.settings = body, material, settings or NewtonSettings()
@@ -154,13 +159,13 @@ class Equilibria:
 
     def _picked(self, field: Tensor) -> Tensor:
         """Free components of a nodal field, (s, n, 3): (s, u)."""
-        return field[:, self._free].flatten(1)
+        return field[:, self._free].reshape(len(field), 3 * len(self._free))
 
     def _spread(self, values: Tensor) -> Tensor:
         """The field that is zero where nodes are held, (s, n, 3)."""
-        return self._field(len(values)).index_copy(1, self._free, values.reshape(len(values), -1, 3))
+        return self._field(len(values)).index_copy(1, self._free, values.reshape(len(values), len(self._free), 3))
 
-    def solve(self, forces: Tensor, start: Tensor | None = None) -> States:
+    def solve(self, forces: ArrayLike | Tensor, start: ArrayLike | Tensor | None = None) -> States:
         """States under loads; each in one step where that succeeds, else in 2, 4, ... parts of the load.
 
         Args:
@@ -170,7 +175,8 @@ class Equilibria:
         Raises:
             ValueError: another shape, numbers that are not finite, or forces on held nodes, where they would be lost.
         """
-        loads = self._picked(self._checked("forces", forces))
+        forces = self._checked("forces", forces)
+        loads = self._picked(forces)
         if loads.square().sum() < (1.0 - _LOST) * forces.square().sum():
             raise ValueError("Equilibria.forces: expected no force on held nodes, where it would be lost; got some.")
         begin = None
@@ -185,11 +191,11 @@ class Equilibria:
             return parts[0]
         return States(*(torch.cat([getattr(part, item.name) for part in parts]) for item in fields(States)))
 
-    def _checked(self, name: str, field: Tensor) -> Tensor:
-        field = field.to(self.device, self.dtype)
-        if field.ndim != 3 or field.shape[1:] != (self.elastic.nodes, 3):
+    def _checked(self, name: str, field: ArrayLike | Tensor) -> Tensor:
+        field = torch.as_tensor(field, dtype=self.dtype, device=self.device)
+        if field.ndim != 3 or field.shape[1:] != (self.elastic.nodes, 3) or not len(field):
             raise ValueError(
-                f"Equilibria.{name}: expected shape (s, {self.elastic.nodes}, 3), got {tuple(field.shape)}."
+                f"Equilibria.{name}: expected shape (s, {self.elastic.nodes}, 3) with s >= 1, got {tuple(field.shape)}."
             )
         if not bool(torch.isfinite(field).all()):
             raise ValueError(f"Equilibria.{name}: expected finite numbers, got NaN or infinity.")

@@ -131,7 +131,7 @@ class ElasticBody(nn.Module):
         """Nodal forces, (s, n, 3), newtons, of stresses P at the points of the quadrature, (s, cells, q, 3, 3)."""
         shares = torch.einsum("scqij,cqkj,cq->scki", stress, self.gradients, self.volumes)
         forces = torch.zeros(len(stress), self.nodes, 3, dtype=stress.dtype, device=stress.device)
-        return forces.index_add(1, self.cells.reshape(-1), shares.reshape(len(stress), -1, 3))
+        return forces.index_add(1, self.cells.reshape(-1), shares.reshape(len(stress), self.cells.numel(), 3))
 
     def cell_stiffnesses(self, displacement: Tensor) -> Tensor:
         """Tangents of the cells, node by node, N/m: (cells, 3k, 3k) at one state, (n, 3), metres; (s, ...) at many."""

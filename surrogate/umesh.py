@@ -155,7 +155,8 @@ class UMeshNetwork(FieldNetwork):
         self.rises = nn.ModuleList(nn.ConvTranspose3d(2 * a, a, 2, 2) for a in reversed(widths[:-1]))
         self.joins = nn.ModuleList(_two(2 * a, a) for a in reversed(widths[:-1]))
         self.leave = nn.Conv3d(channels, 3, 1)
-        # Channels last: on an H200 a training step of 128 channels in bfloat16 takes 8 ms, and 735 the other way.
+        # Channels last: the other way cuDNN takes slow kernels (1.4 steps a second on an H100, 64 on an H200 this way:
+        # benchmarks/results/gpu).
         self.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]  # which no stub knows
 
     def moved(self, forces: Tensor) -> Tensor:

@@ -118,7 +118,8 @@ def test_what_it_cannot_solve_is_refused(change: dict[str, object], message: str
 @pytest.mark.parametrize(
     ("loads", "message"),
     [
-        (torch.zeros(2, 5, 3), r"forces: expected shape \(s, 63, 3\), got \(2, 5, 3\)"),
+        (torch.zeros(2, 5, 3), r"forces: expected shape \(s, 63, 3\) with s >= 1, got \(2, 5, 3\)"),
+        (torch.zeros(0, 63, 3), r"forces: expected shape \(s, 63, 3\) with s >= 1, got \(0, 63, 3\)"),
         (torch.full((1, 63, 3), torch.nan), "forces: expected finite numbers"),
         (torch.ones((1, 63, 3)), "forces: expected no force on held nodes"),
     ],
@@ -126,6 +127,17 @@ def test_what_it_cannot_solve_is_refused(change: dict[str, object], message: str
 def test_loads_that_are_none_are_refused(loads: torch.Tensor, message: str, solver: Equilibria) -> None:
     with pytest.raises(ValueError, match=message):
         solver.solve(loads)
+
+
+def test_a_gpu_that_is_not_there_is_said(bar: Body) -> None:
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    with pytest.raises(ValueError, match="device: expected a GPU that torch can use, found none"):
+        Equilibria(bar, NeoHookean(4500.0, 0.45), "cuda")
+
+
+def test_arrays_are_taken(solver: Equilibria) -> None:
+    assert solver.solve(np.zeros((2, 63, 3))).displacement.abs().max() == 0.0
 
 
 @pytest.mark.parametrize("name", ["tolerance", "iterations", "load_steps", "chunk"])
