@@ -97,7 +97,8 @@ def test_files_that_are_named_are_there(page: str) -> None:
         r"`((?:tests|ci|benchmarks|examples|meshes|reference|surrogate|registration|app)/[\w./-]+)`",
         (ROOT / page).read_text(),
     )
-    assert [name for name in named if not (ROOT / name).exists()] == []
+    made = (ROOT / ".gitignore").read_text().split()  # what a command makes is named too, and is in no fresh clone
+    assert [name for name in named if f"/{name}" not in made and not (ROOT / name).exists()] == []
 
 
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
