@@ -133,7 +133,6 @@ contract() { bash ci/no-fenicsx.sh contract "$LOGS/contract.xml"; }
 slow() { run_tests slow "${parallel[@]}" -m "slow and not mpi and not browser" tests; }
 slow_apart() { run_tests slow-apart -m "slow and (mpi or browser)" tests; }
 
-lane types
 group format format
 group lint lint
 group layers layers
@@ -141,8 +140,9 @@ group docs docs
 if [ -f build/site/index.html ] && grep -qs ^passed "$LOGS/docs.outcome"; then
     export SOFTTWIN_SITE="$ROOT/build/site" # the tests of the site read this one
 fi
-join
+lane types contract # they wait for the disk and for one another, and fill what the tests leave of two cores
 group tests tests
+join
 if [ ! -d ../shared/data/liver ]; then
     asked liver && NAMES+=(liver)
     echo "skipped: the real liver is not there (../shared/data/liver, seen from the repository's root)" >"$LOGS/liver.log"
@@ -150,7 +150,7 @@ if [ ! -d ../shared/data/liver ]; then
 elif [ ${#ASKED[@]} != 0 ]; then # else among the tests
     group liver run_tests liver "${parallel[@]}" -m "liver and not slow" tests
 fi
-lane ranks contract # a browser leaves a core idle, and whoever starts programs waits for them
+lane ranks # a browser leaves a core idle, and whoever starts programs waits for them
 group browser browser
 join
 if [ $ALL = 1 ] || [ ${#ASKED[@]} != 0 ]; then
