@@ -176,7 +176,6 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
         "pose": twin.coordinates.motion(result.pose.matrix).tolist(),
         "points": result.points,
         "points_left_out": result.left_out,
-        "points_alike": result.inflation_factor,
         "outliers": result.outliers,
         "informed": result.informed,
         "iterations": len(result.trace),
@@ -186,7 +185,7 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
     correction = pose_correction_of(result)
     if correction is not None:
         row["pose_correction"] = correction
-    shared = result.problem.correlated
+    shared = None
     if shared is not None:
         row["shared_noise"] = {"size_m": shared.size, "length_m": shared.length}
     if result.estimates:

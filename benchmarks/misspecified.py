@@ -182,7 +182,6 @@ def one(twin: Any, truth: Floats, net: Floats, cloud: Floats) -> dict[str, Any]:
         },
         "z2": float(off @ np.linalg.solve(result.net_force_covariance, off) / 3.0),
         "force_off": float(np.linalg.norm(off) / np.linalg.norm(net)),
-        "alike": result.inflation_factor,
         "seconds": result.seconds,
     }
 

@@ -101,7 +101,7 @@ def judge(
     state: State,
     expected: Expectations,
     discrepancy_scale: float = 1.0,
-    inflation_factor: float = 1.0,
+    
 ) -> Judgement:
     """The verdict on a solver's result.
 
@@ -111,7 +111,6 @@ def judge(
         state: the body's state there.
         expected: what a usable result looks like.
         discrepancy_scale: how large the model's error was found, in units of its samples'.
-        inflation_factor: how many correlated residuals count as one.
     """
     checks = (
         _convergence(found),
@@ -120,7 +119,7 @@ def judge(
         *_state(problem, state, expected),
         *_discrepancy(problem, found, expected, discrepancy_scale),
         *_pose(problem, found, expected),
-        *_left_out(problem, found, inflation_factor),
+        *_left_out(problem, found),
         *_parameters(problem, found, expected),
         *_landmarks(problem, found),
         *_normals(problem, found),
@@ -180,7 +179,7 @@ def _cloud(problem: Problem, found: SolverResult, expected: Expectations) -> Ite
 def _fit(problem: Problem, found: SolverResult, expected: Expectations) -> Iterator[Check]:
     match = found.evaluation.match
     by_patches = problem.shared_noise(found.evaluation)
-    noise = float(np.hypot(found.posterior.scales.noise, np.sqrt(np.mean(by_patches**2))))
+    noise = float(np.hypot(found.local.noise, np.sqrt(np.mean(by_patches**2))))
     yield _check(
         Code.MISFIT,
         noise,
@@ -317,14 +316,14 @@ def _largest_normal(value: float, count: int) -> tuple[str, float]:
     return f"largest of {count} standard normal deviations" if count > 1 else "standard normal", chance
 
 
-def _left_out(problem: Problem, found: SolverResult, inflation_factor: float) -> Iterator[Check]:
+def _left_out(problem: Problem, found: SolverResult) -> Iterator[Check]:
     """What is no unknown here, and would explain the cloud better: its scale, and a pose that was given as exact."""
-    told = score(found.local, by_scale(found.local), inflation_factor)
+    told = score(found.local, by_scale(found.local))
     if told is not None:
         yield _scored(Code.SCALE, told, False, "")  # see `score.by_scale`: shown, and decides nothing
     if problem.pose is not None:
         return
-    told = score(found.local, by_rigid_motion(found.local), inflation_factor)
+    told = score(found.local, by_rigid_motion(found.local))
     if told is not None:
         turn, shift = (float(np.linalg.norm(part)) for part in np.split(told.estimate, 2))
         matters = max(turn * problem.observed.body.size / 2.0, shift) > problem.noise.median

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,19 +15,19 @@ from scipy.linalg import cho_factor, cho_solve
 from softtwin.reference.data.outcome import NotConverged
 
 from . import landmarks
-from .correlated import find_correlated
-from .hyperparameters import Hyperparameters, estimate_hyperparameters, linearised
+from .evidence import Evidence, LinearProblem
+from .hyperparameters import Hyperparameters
 from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
-from .posterior import Posterior, posterior
-from .problem import Evaluation, Problem
-from .residual_correlation import variance_inflation
+from .posterior import Posterior
+from .problem import LENGTH, NOISE, SCALE, SIZE, Evaluation, Problem
 
 Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
 _KEPT = 0.2  # a whole step that misses its promise by less: where only a start is wanted, it was the last
 _TRUSTED = 3.0  # deviations
 _NEARER = 1e-3  # part of the objective that closest points searched anew must take away to go on
+_GROUPS = 6  # of points, by how far the model's error makes them doubtful
 _UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
 
 
@@ -158,20 +158,25 @@ class GaussNewton:
         """The same, which takes any start for the end: to judge it."""
         return replace(self, losses=self.losses[:1], settled=1e9, handed_on=1e9, graduation=0.0)
 
-    def solve(self, problem: Problem, start: Floats, near: Evaluation | None = None) -> SolverResult:
+    def solve(
+        self, problem: Problem, start: Floats, near: Evaluation | None = None, eta: Floats | None = None
+    ) -> SolverResult:
         """The coefficients that minimise the robust distance plus the prior.
 
         Args:
             problem: what is registered.
             start: coefficients to start from, (k,).
             near: a trial whose state is near the start's.
+            eta: logarithms of the hyperparameters at the start, where they are known.
 
         Raises:
             NotConverged: the model found no state at the start.
         """
-        return _Search(self, problem, start, near).run()
+        return _Search(self, problem, start, near, eta).run()
 
-    def has_settled(self, problem: Problem, evaluation: Evaluation, noise: float) -> bool:
+    def has_settled(
+        self, problem: Problem, evaluation: Evaluation, noise: float, eta: Floats | None = None
+    ) -> bool:
         """Whether no step would be taken from a trial, its closest points left as they are.
 
         Args:
@@ -179,18 +184,24 @@ class GaussNewton:
             evaluation: where.
             noise: standard deviation of a point's distance as far as it is known, metres.
         """
-        local = LocalModel(problem, evaluation, self.losses[-1], noise, self.graduation)
+        starts = [] if eta is None else [eta]
+        local = LocalModel(problem, evaluation, self.losses[-1], noise, self.graduation, starts=starts)
         return local.length < self.settled and not local.is_graduated
 
 
 class _Search:
     """One run of the solver: where it is, how far it may step, what it has seen."""
 
-    def __init__(self, options: GaussNewton, problem: Problem, start: Floats, near: Evaluation | None) -> None:
-        self.options, self.problem = options, problem
-        self.evaluation = _begun(problem, start, near)
+    def __init__(
+        self, options: GaussNewton, problem: Problem, start: Floats, near: Evaluation | None, eta: Floats | None
+    ) -> None:
+        self.options, self.whole = options, problem
+        self.problem = problem if len(options.losses) == 1 else problem.unshared
+        start = start if len(start) == self.problem.size else start[: self.problem.size]
+        self.evaluation = _begun(self.problem, start, near)
         self.evaluations, self.limit = 1, self._first_limit
-        self.noise, self.own = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum), 0.0
+        self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
+        self.eta: Floats | None = eta
         self.trace: list[IterationRecord] = []
         self._at: LocalModel | None = None
 
@@ -201,6 +212,11 @@ class _Search:
     def run(self) -> SolverResult:
         options = self.options
         ended = [self._descend(loss, options.handed_on) for loss in options.losses[:-1]]
+        if self.problem is not self.whole:
+            self.problem, self._at = self.whole, None
+            grown = np.zeros(self.whole.size)
+            grown[: len(self.evaluation.coefficients)] = self.evaluation.coefficients
+            self.evaluation = replace(self.evaluation, coefficients=grown)
         outcome = self._descend(options.losses[-1], options.settled)
         if outcome in (Outcome.NO_DESCENT, Outcome.MAXIMUM_ITERATIONS, Outcome.OUT_OF_TIME) and self._has_enough():
             outcome = Outcome.CONVERGED
@@ -214,11 +230,26 @@ class _Search:
         at = self._at
         if at is None or at.evaluation is not self.evaluation or at.loss is not loss:
             jacobian = None if at is None or at.evaluation is not self.evaluation else at.jacobian
+            starts = self._starts() if at is None or at.loss is not loss else [at.eta]
             at = LocalModel(
-                self.problem, self.evaluation, loss, self.noise, self.options.graduation, jacobian, self.own
+                self.problem, self.evaluation, loss, self.noise, self.options.graduation, jacobian, starts
             )
-            self._at, self.noise, self.own = at, at.noise, at.own
+            self._at, self.noise, self.eta = at, at.noise, at.eta
         return at
+
+    def _starts(self) -> list[Floats]:
+        """From where hyperparameters are sought when nothing near is known: without and with noise that is shared."""
+        believed = self.problem.belief.median.copy()
+        if self.eta is not None:
+            believed = self.eta.copy()
+        believed[0] = np.log(self.noise)
+        if self.problem.shared is None:
+            return [believed]
+        with_it = believed.copy()
+        with_it[SIZE], with_it[LENGTH] = np.log(self.noise), self.problem.belief.median[LENGTH]
+        without = believed.copy()
+        without[SIZE] = self.problem.belief.median[SIZE]
+        return [without, with_it]
 
     def _descend(self, loss: Loss, settled: float) -> Outcome:
         is_handed_on, is_exact = settled >= self.options.handed_on, False
@@ -305,16 +336,16 @@ def _next_limit(limit: float, taken: float, gain: float) -> float:
 
 
 class LocalModel:
-    """The Gauss-Newton model of the objective about a trial, at the scales found there.
+    """The Gauss-Newton model of the objective about a trial, at the hyperparameters found there.
 
     Args:
         problem: what is registered.
         evaluation: where.
         loss: of the points.
-        noise: their scale so far, metres, for the weights that the scales are found with.
+        noise: their scale so far, metres, for the weights that the hyperparameters are found with.
         graduation: the noise is taken as at least this part of what the linear model promises to change.
         jacobian: of the distances at the trial, (p, k), where it is known.
-        own: the points' own noise so far, metres, without what is yet to be explained; None for all of it.
+        starts: logarithms of hyperparameters that the search for them begins with; those that are believed if none.
     """
 
     def __init__(
@@ -325,28 +356,26 @@ class LocalModel:
         noise: float,
         graduation: float = 0.0,
         jacobian: Floats | None = None,
-        own: float | None = None,
+        starts: Sequence[Floats] = (),
     ) -> None:
         self.problem, self.evaluation, self.loss = problem, evaluation, loss
-        self.own = noise if own is None else own
         self.was_whole = True
-        left_out = problem.left_out(evaluation)
         self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
-        self.scales, self.is_graduated = self._found_scales(loss, noise, left_out, graduation)
-        self.noise = self.scales.noise
-        self.deviations = np.hypot(self.noise, left_out)
-        residuals = problem.residuals(evaluation, self.own)
-        self.weights = loss.weight(residuals / self.deviations)
-        self.precision = np.ones(problem.size)
-        self.precision[problem.force_part] = 1.0 / self.scales.force**2
-        trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
-        self.information = trusted.T @ trusted
         off, leaning = problem.landmark_residuals(evaluation), problem.normal_residuals(evaluation)
         self.landmark_information, by_landmarks = _told(
             off, landmarks.LOSS, lambda: problem.landmark_jacobian(evaluation)
         )
         self.normal_information, by_normals = _told(leaning, loss, lambda: problem.normal_jacobian(evaluation))
         self._beside = by_landmarks + by_normals
+        self.left_out = problem.rough(evaluation)
+        self.eta, self.is_graduated = self._found(noise, graduation, list(starts))
+        self.scales = Hyperparameters(*np.exp(self.eta))
+        self.noise = self.scales.noise
+        self.deviations = np.hypot(self.noise, self.scales.discrepancy * self.left_out)
+        residuals = problem.residuals(evaluation, self.noise)
+        self.weights = loss.weight(residuals / self.deviations)
+        self.precision = np.exp(-problem.variances(self.eta)[0])
+        self.information = self._products(self.weights / self.deviations**2)
         self._hessian = self.information + self.landmark_information + self.normal_information + np.diag(self.precision)
         self.gradient = self._gradient(residuals, self.weights)
         self.value = self.objective(evaluation, loss)
@@ -355,24 +384,54 @@ class LocalModel:
         by_distances = weights * residuals / self.deviations**2
         return by_distances @ self.jacobian + self.precision * self.evaluation.coefficients + self._beside
 
-    def _found_scales(
-        self, loss: Loss, noise: float, left_out: Floats, graduation: float
-    ) -> tuple[Hyperparameters, bool]:
-        """Scales, and whether the noise is held above what the linear model alone would believe: the points' own."""
-        problem, part = self.problem, self.problem.force_part
-        beside = self.jacobian[:, part.stop :], self.evaluation.coefficients[part.stop :]
-        coefficients, residuals = self.evaluation.coefficients[part], problem.residuals(self.evaluation, self.own)
-        deviations = np.hypot(noise, left_out)
-        weights = loss.weight(residuals / deviations)
-        shares = (noise / deviations) ** 2
-        jacobian = self.jacobian[:, part]
-        local = linearised(jacobian, residuals, weights, coefficients, loss.consistency, noise, beside, shares)
-        scales = estimate_hyperparameters(local, problem.noise, problem.forces.scale)
-        self.own = scales.noise
-        minimum = graduation * local.promised(scales, coefficients)
-        if minimum <= scales.noise:
-            return scales, False
-        return estimate_hyperparameters(local, problem.noise.with_minimum(minimum), problem.forces.scale), True
+    def _products(self, weights: Floats) -> Floats:
+        trusted = np.sqrt(weights)[:, None] * self.jacobian
+        found: Floats = trusted.T @ trusted
+        return found
+
+    def _evidence(self, noise: float, rough: float) -> Evidence:
+        """Of the hyperparameters, with the weights that the points have at some noise, metres, and model error."""
+        problem, coefficients = self.problem, self.evaluation.coefficients
+        residuals = problem.residuals(self.evaluation, noise)
+        weights = self.loss.weight(residuals / np.hypot(noise, rough * self.left_out))
+        data = self.jacobian @ coefficients - residuals
+        known = self.landmark_information + self.normal_information
+        groups = _groups(self.left_out)
+        trusted = np.sqrt(weights)[:, None] * self.jacobian
+        beyond = 1.0 / self.loss.consistency - 1.0
+        linear = LinearProblem(
+            np.stack([trusted[group].T @ trusted[group] for group in groups]),
+            np.stack([(weights[group] * data[group]) @ self.jacobian[group] for group in groups]),
+            np.array([data[group] @ (weights[group] * data[group]) for group in groups]),
+            np.array([weights[group].sum() for group in groups]),
+            np.array([beyond * (residuals[group] @ (weights[group] * residuals[group])) for group in groups]),
+            None if isinstance(known, float) else (known, known @ coefficients - self._beside),
+        )
+        there = np.sqrt([np.mean(self.left_out[group] ** 2) for group in groups])
+        return Evidence(linear, problem.noises(there), problem.variances, problem.belief)
+
+    def _found(self, noise: float, graduation: float, starts: list[Floats]) -> tuple[Floats, bool]:
+        """Logarithms of the hyperparameters, and whether the noise is held above what the linear model would believe."""
+        evidence = self._evidence(noise, float(np.exp(starts[0][SCALE])) if starts else 1.0)
+        if not starts:
+            start = evidence.belief.median.copy()
+            start[0] = np.log(noise)
+            starts = [start]
+        eta = evidence.maximum(starts)
+        minimum = np.log(max(graduation * self._promised(evidence, eta), 1e-300))
+        if minimum <= eta[0]:
+            return eta, False
+        held = replace(evidence, belief=evidence.belief.with_minimum(0, minimum))
+        return held.maximum([eta]), True
+
+    def _promised(self, evidence: Evidence, eta: Floats) -> float:
+        """Root mean square change of the residuals by the best step at some hyperparameters, metres."""
+        linear, root = evidence.problem, np.exp(0.5 * self.problem.variances(eta)[0])
+        matrix, pull = linear.weighted(np.exp(-evidence.noise(eta)[0]))
+        matrix = root[:, None] * matrix * root + np.eye(len(root))
+        step = root * np.linalg.solve(matrix, root * pull) - self.evaluation.coefficients
+        square = float(np.einsum("gij,i,j->", linear.information, step, step, optimize=True))
+        return float(np.sqrt(max(square, 0.0) / max(linear.count.sum(), 1.0)))
 
     @cached_property
     def _scaled_hessian(self) -> Floats:
@@ -414,7 +473,7 @@ class LocalModel:
     def objective(self, evaluation: Evaluation, loss: Loss) -> float:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ evaluation.coefficients**2)
-        scaled = self.problem.residuals(evaluation, self.own) / self.deviations
+        scaled = self.problem.residuals(evaluation, self.noise) / self.deviations
         off = self.problem.landmark_residuals(evaluation)
         leaning = self.problem.normal_residuals(evaluation, self.evaluation.match)
         beside = float(landmarks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
@@ -427,7 +486,7 @@ class LocalModel:
 
     def length_for(self, evaluation: Evaluation) -> float:
         """The same at a trial of the same coefficients with other closest points, with these derivatives."""
-        residuals = self.problem.residuals(evaluation, self.own)
+        residuals = self.problem.residuals(evaluation, self.noise)
         gradient = self._gradient(residuals, self.loss.weight(residuals / self.deviations))
         return _length(self._whole_for(gradient), gradient)
 
@@ -454,32 +513,33 @@ class LocalModel:
         """Largest predicted movement of an observed node, metres."""
         return float(self.problem.moved(self.evaluation, change).max())
 
-    def posterior(self, inflation_factor: float = 1.0) -> Posterior:
-        """Laplace's approximation at the trial.
+    def posterior(self) -> Posterior:
+        """Laplace's approximation at the trial, with what the doubt of the hyperparameters moves."""
+        root = 1.0 / np.sqrt(self.precision)
+        inverse = np.linalg.inv(self._scaled_hessian)
+        covariance = root[:, None] * inverse * root
+        told = self.information + self.landmark_information + self.normal_information
+        shares = np.einsum("ij,ji->i", covariance, told)
+        informed = float(shares[: self.problem.error_part.stop].sum())
+        moved, spread = self._by_hyperparameters(covariance)
+        return Posterior(self.evaluation.coefficients, covariance + moved @ spread @ moved.T, self.scales, informed)
 
-        Args:
-            inflation_factor: so many points tell what one would that errs by itself.
-        """
-        count = self.problem.forces.size
-        told = (self.information + self.normal_information) / inflation_factor + self.landmark_information
-        noise = self.problem.noise_part
-        return posterior(told, self.precision, self.evaluation.coefficients, self.scales, count, noise)
+    def _by_hyperparameters(self, covariance: Floats) -> tuple[Floats, Floats]:
+        """Derivative of the mean by the logarithms of the hyperparameters, (k, h), and their covariance, (h, h)."""
+        evidence = self._evidence(self.noise, self.scales.discrepancy)
+        _, slopes = self.problem.variances(self.eta)
+        held = self.precision * self.evaluation.coefficients
+        columns = (slopes * held).T
+        pull = -2.0 * (held + self._beside)
+        columns[:, NOISE] = pull
+        return covariance @ columns, evidence.curvature(self.eta)
 
-    def correlated(self, worth: float) -> tuple[float, float] | None:
-        """Size and length of the noise that neighbours share, metres; None where the cloud does without.
 
-        Args:
-            worth: least logarithm of the odds for it.
-        """
-        problem = self.problem
-        weights = np.clip(self.weights, 0.0, 1.0)
-        linear = problem.linear(self.evaluation, self.jacobian, self.noise, weights)
-        return find_correlated(linear, problem.noise, problem.forces.scale, worth)
-
-    def inflation_factor(self) -> float:
-        """How many correlated residuals count as one independent residual; see `variance_inflation`."""
-        scaled = self.problem.residuals(self.evaluation, self.own) / self.deviations
-        return variance_inflation(self.problem.observed.closest_points(self.evaluation.match), scaled, self.weights)
+def _groups(rough: Floats) -> list[NDArray[np.int64]]:
+    """Points of like variance: numbers of those in each group."""
+    if not rough.any():
+        return [np.arange(len(rough))]
+    return [group for group in np.array_split(np.argsort(rough), _GROUPS) if len(group)]
 
 
 def _told(off: Floats, loss: Loss, jacobian: Callable[[], Floats]) -> tuple[Floats | float, Floats | float]:

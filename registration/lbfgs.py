@@ -71,7 +71,9 @@ class LBFGS:
         """The same with one short run: to judge a start."""
         return replace(self, losses=self.losses[:1], max_iterations=1)
 
-    def solve(self, problem: Problem, start: Floats, near: Evaluation | None = None) -> SolverResult:
+    def solve(
+        self, problem: Problem, start: Floats, near: Evaluation | None = None, eta: Floats | None = None
+    ) -> SolverResult:
         """The coefficients that minimise the robust distance plus the prior.
 
         Args:
@@ -110,8 +112,7 @@ class _Run:
     def _descend(self, loss: Loss, local: LocalModel) -> Outcome:
         """One run at fixed scales, in coefficients of unit prior variance."""
         problem, scales = self.problem, local.scales
-        root = np.ones(problem.size)
-        root[problem.force_part] = scales.force
+        root = 1.0 / np.sqrt(local.precision)
         minimum = np.inf
         met_wall = False
 
@@ -160,7 +161,7 @@ class _Run:
 
 def _objective(problem: Problem, evaluation: Evaluation, loss: Loss, local: LocalModel) -> tuple[float, Floats]:
     """Robust distances and their gradient by the coefficients, (k,), at the scales of a model."""
-    scaled = problem.residuals(evaluation, local.own) / local.deviations
+    scaled = problem.residuals(evaluation, local.noise) / local.deviations
     slope = loss.weight(scaled) * scaled / local.deviations
     value, gradient = float(loss.value(scaled).sum()), problem.vjp(evaluation, slope)
     off, held = problem.landmark_residuals(evaluation), local.evaluation.match

@@ -36,27 +36,3 @@ class Posterior:
             left_out: covariance for unit scale of directions of force that are no unknowns, (3, 3).
         """
         return net @ self.covariance @ net.T + self.scales.force**2 * left_out
-
-
-def posterior(
-    information: Floats, precision: Floats, mean: Floats, scales: Hyperparameters, forces: int, apart: slice = slice(0)
-) -> Posterior:
-    """The posterior for the information of the points, (k, k), and the prior's precision, (k,).
-
-    The force scale is found from the same cloud: how far its own doubt moves the mean is part of the covariance (Kass
-    and Steffey 1989).
-
-    Args:
-        information: J^T W J with the weights over the variances, per squared unit of the coefficients.
-        precision: of the prior, (k,).
-        mean: the coefficients found, (k,).
-        scales: noise and force scale.
-        forces: number of coefficients that the force scale belongs to, the first.
-        apart: coefficients that count for no direction told: those of noise.
-    """
-    covariance = np.linalg.inv(information + np.diag(precision))
-    by_scale = 2.0 * covariance[:, :forces] @ (precision * mean)[:forces]  # of the mean, by the logarithm of the scale
-    moved: Floats = scales.spread[1] * by_scale
-    shares = np.einsum("ij,ji->i", covariance, information)
-    informed = float(shares.sum() - shares[apart].sum())
-    return Posterior(mean, covariance + moved[:, None] * moved, scales, informed)

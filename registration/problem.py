@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from .cloud import Cloud
-from .correlated import CorrelatedNoise, Linear
+from .evidence import Belief, Variances
 from .forward import ParametrisedModel, ParametrisedState, ReducedModel, ReducedState
 from .hyperparameters import LogNormalPrior
 from .landmarks import LandmarkPairs
@@ -20,9 +20,16 @@ from .parameter_blocks import ParameterBlocks
 from .pose import Pose
 from .priors import ModelError, NodalForces, PosePrior
 from .residuals import Correspondence, SurfaceDistance
+from .surface_modes import SurfaceModes
 
 Floats = NDArray[np.float64]
-_COUNTED = 0.2  # weight: points with less are outliers
+import os
+
+NOISE, FORCE, SIZE, LENGTH, SCALE = range(5)  # places of the hyperparameters
+_SIZE, _SIZE_SPREAD, _LARGEST = 2e-6, 3.0, 5e-3  # metres: of shared noise; none, unless the cloud says so
+_LENGTH, _LENGTH_SPREAD, _LONGEST = 0.15, 0.5, 3.0  # of the root of the area; times the median
+_EDGES = 1.75  # of the surface: the shortest length
+_SCALE_SPREAD, _LEAST_SCALE, _MOST_SCALE = float(os.environ.get("SSP","0.25")), float(os.environ.get("LEAST","1")), 10.0  # of the model's error
 _WATCHED = 300  # nodes whose movement limits a step
 # Radians, of a measured normal across itself: cameras' are off by some 10 degrees, and flat triangles by some more.
 NORMAL_DEVIATION = float(np.deg2rad(10.0))
@@ -33,7 +40,7 @@ class Evaluation:
     """The problem at one set of coefficients.
 
     Args:
-        coefficients: of forces, pose, conditions, correlated noise and model error, (k,).
+        coefficients: of forces, pose, conditions, model error, shared noise, (k,).
         state: the body's state as the model has it.
         positions: displacement of the observed nodes with the model's error, (m, 3), metres.
         pose: from the body's coordinates to the cloud's; None where it is not unknown.
@@ -66,7 +73,7 @@ class Problem:
         tangent_basis: two unit vectors across each point's measured normal, in the cloud's axes, (p, 2, 3): how far the
             surface leans towards them pulls, too; None for a cloud without normals.
         normal_deviation: standard deviation of that, radians.
-        correlated: noise that neighbouring points share, as unknowns; None where each point errs by itself.
+        shared: modes of the noise that neighbouring points share; None where each point errs by itself.
     """
 
     model: ReducedModel
@@ -80,7 +87,7 @@ class Problem:
     landmarks: LandmarkPairs | None = None
     tangent_basis: Floats | None = None
     normal_deviation: float = NORMAL_DEVIATION
-    correlated: CorrelatedNoise | None = None
+    shared: SurfaceModes | None = None
 
     @classmethod
     def seen(cls, cloud: Cloud, **given: Any) -> Problem:
@@ -94,8 +101,8 @@ class Problem:
 
     @property
     def size(self) -> int:
-        """Number of coefficients: of the forces, the pose, conditions, correlated noise and the model's error."""
-        return self.noise_part.stop + (0 if self.error is None else self.error.count)
+        """Number of coefficients: of forces, pose, conditions, model error and shared noise."""
+        return self.noise_part.stop
 
     @cached_property
     def force_part(self) -> slice:
@@ -114,21 +121,27 @@ class Problem:
         return slice(begin, begin + (0 if self.parameter_blocks is None else self.parameter_blocks.count))
 
     @cached_property
-    def noise_part(self) -> slice:
-        """Where those of the correlated noise are."""
-        begin = self.parameter_part.stop
-        return slice(begin, begin + (0 if self.correlated is None else self.correlated.count))
-
-    @cached_property
     def error_part(self) -> slice:
         """Where those of the model's error are."""
-        return slice(self.noise_part.stop, None)
+        begin = self.parameter_part.stop
+        return slice(begin, begin + (0 if self.error is None else self.error.count))
 
     @cached_property
-    def _near(self) -> Floats:
-        """How much noise the points have in common with those that carry it, (p, q)."""
-        assert self.correlated is not None
-        return self.correlated.near(self.cloud)
+    def rest_part(self) -> slice:
+        """Where those of what its patterns leave out are."""
+        begin = self.error_part.stop
+        return slice(begin, begin + (0 if self.error is None else len(self.error.rest_modes.values)))
+
+    @cached_property
+    def noise_part(self) -> slice:
+        """Where those of the noise that neighbours share are."""
+        begin = self.rest_part.stop
+        return slice(begin, begin + (0 if self.shared is None else len(self.shared.values)))
+
+    @cached_property
+    def unshared(self) -> Problem:
+        """The same without noise that neighbours share: its coefficients are the first of these."""
+        return self if self.shared is None else replace(self, shared=None)
 
     def normals(self, evaluation: Evaluation) -> Floats:
         """Of the surface at the points, (p, 3), on the cloud's axes."""
@@ -137,13 +150,36 @@ class Problem:
 
     def shared_noise(self, evaluation: Evaluation) -> Floats:
         """The part of the distances that is taken for noise that neighbours share, (p,), metres."""
-        if self.correlated is None:
+        if self.shared is None:
             return np.zeros(len(self.cloud))
-        return self.correlated.shifts(evaluation.coefficients[self.noise_part], self._near, self.normals(evaluation))
+        field = self.shared.modes @ evaluation.coefficients[self.noise_part]
+        return self.observed.at_vertices(evaluation.match, field)
 
-    def _by_noise(self, evaluation: Evaluation) -> Floats | None:
-        """Derivative of the residuals by its coefficients, (p, q)."""
-        return None if self.correlated is None else -self.correlated.patterns(self._near, self.normals(evaluation))
+    def left_out(self, evaluation: Evaluation) -> Floats:
+        """The part of the distances that is taken for what the patterns of the model's error leave out, (p,), metres."""
+        if self.error is None:
+            return np.zeros(len(self.cloud))
+        field = self.error.rest_modes.modes @ evaluation.coefficients[self.rest_part]
+        there = self.observed.at_points(evaluation.match, self.error.rest)
+        return there * self.observed.at_vertices(evaluation.match, field)
+
+    def rough(self, evaluation: Evaluation) -> Floats:
+        """Standard deviation of each distance by what changes from point to point of it, (p,), metres."""
+        if self.error is None:
+            return np.zeros(len(self.cloud))
+        there = self.observed.at_points(evaluation.match, self.error.rest)
+        return float(os.environ.get('BEYOND','3'))**.5*there
+
+    def _by_distances(self, evaluation: Evaluation) -> Floats:
+        """Derivative of the residuals by the coefficients that change the distances alone, (p, q)."""
+        match, columns = evaluation.match, [np.zeros((len(self.cloud), 0))]
+        corners = self.observed.triangles[match.triangles]
+        if self.error is not None:
+            there = self.observed.at_points(match, self.error.rest)
+            columns.append(-there[:, None] * self.error.rest_modes.at(corners, match.weights))
+        if self.shared is not None:
+            columns.append(-self.shared.at(corners, match.weights))
+        return np.hstack(columns)
 
     def carried(self, coefficients: Floats, before: Problem) -> Floats:
         """Coefficients of another problem for a start of this one, (k,); what it did not have is zero.
@@ -154,37 +190,56 @@ class Problem:
         """
         start = np.zeros(self.size)
         start[: self.parameter_part.stop] = coefficients[: before.parameter_part.stop]
-        mine, other = self.correlated, before.correlated
-        if mine is not None and other is not None and mine.centres is other.centres:
-            start[self.noise_part] = coefficients[before.noise_part]
-        errors = coefficients[before.error_part]
-        if len(errors) == self.size - self.noise_part.stop:
-            start[self.error_part] = errors
+        for mine, other in ((self.error_part, before.error_part), (self.noise_part, before.noise_part)):
+            if mine.stop - mine.start == other.stop - other.start:
+                start[mine] = coefficients[other]
+        if self.rest_part.stop - self.rest_part.start == before.rest_part.stop - before.rest_part.start:
+            start[self.rest_part] = coefficients[before.rest_part]
         return start
 
-    def linear(self, evaluation: Evaluation, jacobian: Floats, noise: float, weights: Floats) -> Linear:
-        """The distances, linear in the unknowns about a trial, without correlated noise.
+    @cached_property
+    def belief(self) -> Belief:
+        """Of the logarithms of the hyperparameters: noise, forces, size and length of shared noise, model's error."""
+        length = np.sqrt(1.0 if self.shared is None else self.shared.area) * _LENGTH
+        shortest = 1e-9 if self.shared is None else _EDGES * self.observed.edge
+        rows = (
+            (self.noise.median, self.noise.spread, max(self.noise.minimum, 1e-9), np.inf),
+            (self.forces.scale.median, self.forces.scale.spread if self.forces.size else 0.0, max(self.forces.scale.minimum, 1e-300), np.inf),
+            (_SIZE, _SIZE_SPREAD if self.shared is not None else 0.0, 1e-9, _LARGEST),
+            (max(length, shortest), _LENGTH_SPREAD if self.shared is not None else 0.0, shortest, _LONGEST * length),
+            (1.0, 0.0 if self.error is None else _SCALE_SPREAD, _LEAST_SCALE, _MOST_SCALE),
+        )
+        median, spread, lowest, highest = (np.array(column) for column in zip(*rows, strict=True))
+        return Belief(np.log(np.maximum(median, lowest)), spread, np.log(lowest), np.log(highest))
+
+    def noises(self, rough: Floats) -> Variances:
+        """Variances of points beside which the model's error is rough, as functions of the hyperparameters.
 
         Args:
-            evaluation: where.
-            jacobian: derivative of the distances there, (p, k).
-            noise: standard deviation of a point's distance, metres.
-            weights: of the points, (p,); those with little are left out.
+            rough: standard deviation of a distance by that, (g,), metres.
         """
-        kept, coefficients = weights > _COUNTED, evaluation.coefficients.copy()
-        coefficients[self.noise_part] = 0.0
-        distances = self.residuals(evaluation, noise) + self.shared_noise(evaluation)
-        columns = np.arange(self.size)
-        others = np.setdiff1d(columns[self.force_part.stop :], columns[self.noise_part])
-        return Linear(
-            self.cloud[kept],
-            self.normals(evaluation)[kept],
-            (jacobian @ coefficients - distances)[kept],
-            jacobian[kept][:, self.force_part],
-            jacobian[kept][:, others],
-            self.left_out(evaluation)[kept],
-            weights[kept],
-        )
+
+        def found(eta: Floats) -> tuple[Floats, Floats]:
+            own, beside = np.exp(2.0 * eta[NOISE]), np.exp(2.0 * eta[SCALE]) * rough**2
+            slopes = np.zeros((len(eta), len(rough)))
+            slopes[NOISE], slopes[SCALE] = 2.0 * own / (own + beside), 2.0 * beside / (own + beside)
+            return np.log(own + beside), slopes
+
+        return found
+
+    def variances(self, eta: Floats) -> tuple[Floats, Floats]:
+        """Logarithms of the coefficients' variances beforehand, (k,), and their derivatives by eta, (5, k)."""
+        logs, slopes = np.zeros(self.size), np.zeros((len(eta), self.size))
+        logs[self.force_part], slopes[FORCE, self.force_part] = 2.0 * eta[FORCE], 2.0
+        if self.error is not None:
+            logs[self.error_part], slopes[SCALE, self.error_part] = 2.0 * eta[SCALE], 2.0
+            logs[self.rest_part] = self.error.rest_logs + 2.0 * eta[SCALE]
+            slopes[SCALE, self.rest_part] = 2.0
+        if self.shared is not None:
+            spread, by_length = self.shared.spread(float(np.exp(eta[LENGTH])))
+            logs[self.noise_part] = 2.0 * eta[SIZE] + spread
+            slopes[SIZE, self.noise_part], slopes[LENGTH, self.noise_part] = 2.0, by_length
+        return logs, slopes
 
     def evaluation(self, coefficients: Floats, near: Evaluation | None = None, *, anew: bool = False) -> Evaluation:
         """The problem at some coefficients.
@@ -236,25 +291,15 @@ class Problem:
             return np.zeros_like(self.observed.body.points)
         return self.error.field(evaluation.coefficients[self.error_part])
 
-    def left_out(self, evaluation: Evaluation) -> Floats:
-        """Standard deviation of each distance by what the patterns of the model's error leave out, (p,), metres.
-
-        Neighbours share it: many points tell no more of it than there are places where it is independent.
-        """
-        if self.error is None:
-            return np.zeros(len(self.cloud))
-        inflation_factor = max(len(self.cloud) / self.error.discrepancy.places, 1.0)
-        return np.sqrt(inflation_factor) * self.observed.at_points(evaluation.match, self.error.rest)
-
     def residuals(self, evaluation: Evaluation, noise: float) -> Floats:
-        """Distances less what they are in the mean for points of some noise, and less shared noise, (p,), metres.
+        """Distances less what they are in the mean for points of some noise, and less what neighbours share, (p,), metres.
 
         Args:
             evaluation: at some coefficients.
             noise: standard deviation of each coordinate of a point, metres.
         """
         expected = self.observed.expected(evaluation.match, noise)
-        return evaluation.match.distances - expected - self.shared_noise(evaluation)
+        return evaluation.match.distances - expected - self.shared_noise(evaluation) - self.left_out(evaluation)
 
     def again(self, evaluation: Evaluation, beyond: float = 0.0) -> Evaluation:
         """The same trial with closest points searched anew.
@@ -272,13 +317,13 @@ class Problem:
         """Derivative of the residuals by the coefficients, (p, k), exact."""
         rows = self.observed.rows(evaluation.match)
         by_pose = self._by_pose(evaluation, evaluation.match.directions, evaluation.cloud)
-        return self._by_coefficients(evaluation, rows, by_pose, self._by_noise(evaluation))
+        return self._by_coefficients(evaluation, rows, by_pose, self._by_distances(evaluation))
 
     def vjp(self, evaluation: Evaluation, cotangent: Floats) -> Floats:
         """Gradient by the coefficients, (k,), from the one by the residuals, (p,): J^T g with the adjoint."""
         rows = self.observed.rows(evaluation.match)
         by_pose = self._by_pose(evaluation, evaluation.match.directions, evaluation.cloud)
-        return self._pulled(evaluation, rows, by_pose, cotangent, self._by_noise(evaluation))
+        return self._pulled(evaluation, rows, by_pose, cotangent, self._by_distances(evaluation))
 
     def landmark_residuals(self, evaluation: Evaluation) -> Floats:
         """Coordinates of the landmarks less where they were found, over their deviation, (3l,), body's axes."""
@@ -365,7 +410,7 @@ class Problem:
         return self._by_pose(evaluation, axes, np.repeat(self._found_marks(evaluation), 3, axis=0))
 
     def _by_coefficients(
-        self, evaluation: Evaluation, rows: csr_array, by_pose: Floats | None, by_noise: Floats | None = None
+        self, evaluation: Evaluation, rows: csr_array, by_pose: Floats | None, by_distances: Floats | None = None
     ) -> Floats:
         """Derivative of linear functions of the observed nodes' displacement, (q, k), for rows (q, 3m)."""
         blocks = [evaluation.state.jacobian(rows)]
@@ -373,10 +418,10 @@ class Problem:
             blocks.append(by_pose)
         if self.parameter_blocks is not None:
             blocks.append(cast(ParametrisedState, evaluation.state).rows_by_parameters(rows))
-        if self.correlated is not None:
-            blocks.append(np.zeros((rows.shape[0], self.correlated.count)) if by_noise is None else by_noise)
         if self.error is not None:
             blocks.append(self.error.jacobian(rows))
+        alone = self.size - self.error_part.stop
+        blocks.append(np.zeros((rows.shape[0], alone)) if by_distances is None else by_distances)
         return np.hstack(blocks)
 
     def _pulled(
@@ -385,7 +430,7 @@ class Problem:
         rows: csr_array,
         by_pose: Floats | None,
         cotangent: Floats,
-        by_noise: Floats | None = None,
+        by_distances: Floats | None = None,
     ) -> Floats:
         """The same, transposed and applied, (k,)."""
         by_nodes = (rows.T @ cotangent).reshape(-1, 3)
@@ -396,10 +441,10 @@ class Problem:
             blocks.append(cotangent @ by_pose)
         if self.parameter_blocks is not None:
             blocks.append(full.ravel() @ cast(ParametrisedState, evaluation.state).by_parameters())
-        if self.correlated is not None:
-            blocks.append(np.zeros(self.correlated.count) if by_noise is None else cotangent @ by_noise)
         if self.error is not None:
             blocks.append(self.error.jacobian(by_nodes.ravel()))
+        alone = self.size - self.error_part.stop
+        blocks.append(np.zeros(alone) if by_distances is None else cotangent @ by_distances)
         return np.concatenate(blocks)
 
     def _by_pose(self, evaluation: Evaluation, directions: Floats, points: Floats) -> Floats | None:

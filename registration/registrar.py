@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, reduce
-from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +17,6 @@ from softtwin.reference.data.outcome import NotConverged
 
 from .checks import Expectations, judge, shared
 from .cloud import Cloud
-from .correlated import CorrelatedNoise, is_noise
 from .forward import ForwardModel, ReducedModel, reduce_model
 from .gauss_newton import GaussNewton, SolverResult
 from .hyperparameters import LogNormalPrior
@@ -26,7 +24,7 @@ from .landmarks import LandmarkPairs
 from .lbfgs import LBFGS
 from .loss import robust_deviation
 from .manifold_mapping import ManifoldMapping
-from .options import NOISE, RegistrationOptions
+from .options import RegistrationOptions
 from .outcome import Outcome
 from .parameter_blocks import ParameterBlocks
 from .pose import Pose
@@ -49,7 +47,7 @@ from .verdict import Check, Code, Verdict
 Floats = NDArray[np.float64]
 # Of the logarithm of a nodal force: with more, forces explain noise and the model's error. Without either, a pull at a
 # few nodes makes it many times what was expected.
-_SPREAD = 0.5
+_SPREAD = 0.35
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
@@ -71,7 +69,6 @@ _LEADING = 6  # directions of force that a cold start begins with
 _ANCHORS = 3  # exact states from which a fast model goes on
 
 
-_Again = Callable[["Registrar", Registration], Registration]  # what a registrar makes of a cloud, from a result for it
 
 
 class Registrar:
@@ -114,10 +111,9 @@ class Registrar:
         self.parameter_blocks, self.modulus_deviation = parameter_blocks, 0.0 if is_found else modulus_deviation
         self.anywhere = None if anywhere is None else cache(anywhere)  # made when it is first asked for
         self.landmarks: LandmarkPairs | None = None
-        self.correlated: CorrelatedNoise | None = None
         self.options = options or RegistrationOptions()
         discrepancy = model.discrepancy
-        self.error = None if discrepancy is None else ModelError.of(discrepancy, observed.nodes)
+        self.error = None if discrepancy is None else ModelError.of(discrepancy, observed)
         # Where it is not known what the model gets wrong, points tell no more than the model can meet.
         self.noise = self.options.noise.with_minimum(model.error)
         self._told = expectations
@@ -159,16 +155,6 @@ class Registrar:
         other.landmarks = landmarks
         return other
 
-    def with_prior(self, correlated: CorrelatedNoise | None) -> Registrar:
-        """The same with noise that the points of a cloud share, or without.
-
-        Args:
-            correlated: of the cloud that comes; None for points that err each by itself.
-        """
-        other = copy.copy(self)
-        other.correlated = correlated
-        return other
-
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud.
 
@@ -201,82 +187,24 @@ class Registrar:
         begin = time.perf_counter()
         points = self._checked(cloud)
         if start is None:
-            return self._afresh(points, begin)
-        before = start.problem.correlated
-        like = self.with_prior(_still_there(before, points))
-        if before is not None and like.correlated is None:
-            return self._afresh(points, begin)
-        result = like._followed(points, start, begin)
-        may_leave = start.prepared is not self._everywhere or before is not None
-        if may_leave and self._has_left(result, start) and not self._is_late:
+            return self._cold(points, begin)
+        result = self._followed(points, start, begin)
+        if self._has_left(result, start) and not self._is_late:
             now = time.monotonic()
             hurried = self.limited(now + _SEARCHING * (self.options.solver.until - now))
-            return hurried._afresh(points, begin, result)
-        if like.correlated is not None or 0 < start.looked_for < _AGAIN:
-            return _carried(result, start)
-        return like._told_apart(result, lambda other, near: other._sought_anew(points, near, begin))
-
-    def _afresh(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
-        """From rest, and once more where neighbours are found to share noise; see `_cold`.
-
-        What is known and meets the cloud as well stays: it may know more of the forces' size than a search from rest.
-        """
-        found = self._cold(points, begin, known)
-        if found is known:
-            return found
-        if known is not None:
-            found = replace(min(found, known, key=badness), seconds=time.perf_counter() - begin)
-        return self._told_apart(found, lambda other, near: other._sought_anew(points, near, begin))
+            other = hurried._cold(points, begin, result)
+            return other if other is result else replace(min(other, result, key=badness), seconds=time.perf_counter() - begin)
+        return result
 
     def _followed(self, points: Cloud, start: Registration, begin: float) -> Registration:
         """From the frame before, or from rest with its forces."""
-        points = self._enough(points)
-        problem = self._problem(points, start.prepared, start, start.discrepancy_scale)
+        problem = self._problem(points, start.prepared, start)
         near = problem.begun(problem.carried(start.evaluation.coefficients, start.problem), start.evaluation)
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
             found = self._from_rest(points, start.prepared, self.options.solver)
             return self._finished(points, start.prepared, found, begin)
-        solver = self.options.solver.following()
-        found = solver.solve(problem, near.coefficients, near)
-        problem, found, discrepancy_scale = self._doubted(problem, found, start.discrepancy_scale, solver)
-        return self._result(problem, found, start.prepared, begin, discrepancy_scale)
-
-    def _told_apart(self, found: Registration, again: _Again) -> Registration:
-        """The result; where its cloud has noise that neighbours share, what is found with that in mind.
-
-        Forces have explained such noise as far as they can: only where it is left to itself it is seen as it is, so
-        that a guess is good enough for a second try, and that one decides. What is shared over less than the edges of
-        the surface is the mesh's own, or noise that no force can follow: the `inflation_factor` reckons with that. What
-        would be larger than any noise, and leaves the search without an end, is none: nothing here explains it.
-        """
-        if not self.options.correlated or found.problem.correlated is not None or found.local is None:
-            return found
-        is_worth_it = found.outcome is not Outcome.REFUSED and found.noise < _HOPELESS * self.expectations.noise
-        if not is_worth_it or not _is_shared(found, self.noise.minimum):
-            return found
-        told, best, near = found.local.correlated(_A_TRY), found, found
-        for _ in range(_TRIES):
-            if not self._is_followed(told):
-                break
-            if self._is_late:
-                return _out_of_time(best, told[1])
-            try:
-                near = again(self.with_prior(_noise_of(near, *told)), near)
-            except NotConverged:
-                break
-            before, told = told, None if near.local is None else near.local.correlated(_WORTH)
-            if self._is_followed(told):
-                best = near if near.outcome.is_success or _is_noise(near.problem.correlated) else best
-                if np.abs(np.log(np.divide(told, before))).max() < _SAME:
-                    break
-        is_tried = near is not found
-        if best is found and is_tried and self._is_followed(told) and not is_noise(told[0]):
-            best = _of_no_force(best, told[1])
-        return replace(best, looked_for=int(best.problem.correlated is None))
-
-    def _is_followed(self, told: tuple[float, float] | None) -> TypeGuard[tuple[float, float]]:
-        """Whether there is such noise, of a length that forces could follow."""
-        return told is not None and told[1] >= _EDGES * self.observed.edge
+        found = self.options.solver.following().solve(problem, near.coefficients, near, start.local.eta)
+        return self._result(problem, found, start.prepared, begin)
 
     @property
     def _is_late(self) -> bool:
@@ -302,22 +230,13 @@ class Registrar:
         """
         begin = time.perf_counter()
         points = self._checked(cloud)
-        noise = draft.problem.correlated
-        if noise is None and last is not None:
-            noise = _still_there(last.problem.correlated, points)
-        like = self.with_prior(noise)
-        found = like._refined(points, draft, fast, last, begin)
-        before, drafted = 0 if last is None else last.looked_for, draft.looked_for if draft.unexplained == 0.0 else 0
-        if 0 < max(drafted, before) < _AGAIN:
-            found = replace(found if last is None else _carried(found, last), looked_for=max(drafted, before + 1))
-        else:
-            found = like._told_apart(found, lambda other, _: other._refined(points, draft, fast, None, begin))
+        found = self._refined(points, draft, fast, last, begin)
         return replace(found, draft=draft)
 
     def _refined(
         self, points: Cloud, draft: Registration, fast: ForwardModel, last: Registration | None, begin: float
     ) -> Registration:
-        points, solver = self._enough(points), self.options.solver.following()
+        solver = self.options.solver.following()
         if last is not None and last.draft is not None and last.draft.prepared is draft.prepared:
             return self._carried_on(points, fast, last, begin)
         # Told a zone, the exact model gathers no forces within it, and takes none that were: see `options_for`.
@@ -328,21 +247,19 @@ class Registrar:
         start = np.zeros(problem.size)
         start[problem.force_part] = prepared.forces.nearest(draft.unknown_forces)
         start[problem.pose_part] = draft.coefficients[draft.problem.pose_part]
-        if draft.problem.correlated is self.correlated:
-            start[problem.noise_part] = draft.coefficients[draft.problem.noise_part]
-        found = self._approached(problem, problem.begun(start, draft.evaluation), fast, solver)
+        start[problem.noise_part] = draft.coefficients[draft.problem.noise_part]
+        found = self._approached(problem, problem.begun(start, draft.evaluation), fast, solver, draft.local.eta)
         return self._finished(points, prepared, found, begin)
 
     def _carried_on(self, points: Cloud, fast: ForwardModel, last: Registration, begin: float) -> Registration:
-        problem = self._problem(points, last.prepared, last, last.discrepancy_scale)
+        problem = self._problem(points, last.prepared, last)
         solver = self.options.solver.following()
         near = replace(last.evaluation, coefficients=problem.carried(last.evaluation.coefficients, last.problem))
-        found = self._approached(problem, near, fast, solver)
-        problem, found, discrepancy_scale = self._doubted(problem, found, last.discrepancy_scale, solver)
-        return self._result(problem, found, last.prepared, begin, discrepancy_scale)
+        found = self._approached(problem, near, fast, solver, last.local.eta)
+        return self._result(problem, found, last.prepared, begin)
 
     def _approached(
-        self, problem: Problem, near: Evaluation, fast: ForwardModel, solver: GaussNewton | LBFGS
+        self, problem: Problem, near: Evaluation, fast: ForwardModel, solver: GaussNewton | LBFGS, eta: Floats
     ) -> SolverResult:
         """The minimum, to which the fast model knows most of the way from any trial of the exact one.
 
@@ -356,7 +273,8 @@ class Registrar:
             place = near.coefficients[problem.force_part]
             reduced = self._reduced(fast, problem.forces)
             cheap = replace(problem, model=ManifoldMapping.at(reduced, self.observed.nodes, place, near.state))
-            way = solver.solve(cheap, near.coefficients, cheap.begun(near.coefficients))
+            way = solver.solve(cheap, near.coefficients, cheap.begun(near.coefficients), eta)
+            eta = way.local.eta
             if not way.trace or self._is_late:
                 break
             try:
@@ -364,11 +282,11 @@ class Registrar:
             except NotConverged:
                 break
             spent.append(replace(way, evaluations=1))  # states of the exact model alone are counted
-            if solver.has_settled(problem, near, way.posterior.scales.noise):
+            if solver.has_settled(problem, near, way.local.noise, eta):
                 break
         if near.cloud is not problem.cloud:
             near = problem.begun(near.coefficients.copy(), near)
-        return reduce(_after, [*spent, solver.solve(problem, near.coefficients, near)])
+        return reduce(_after, [*spent, solver.solve(problem, near.coefficients, near, eta)])
 
     def _reduced(self, fast: ForwardModel, forces: NodalForces) -> ReducedModel:
         """The fast model between this one's forces and the observed nodes; that of the last forces is kept."""
@@ -410,18 +328,18 @@ class Registrar:
             parameter_blocks=self.parameter_blocks,
             landmarks=self.landmarks,
             normal_deviation=self.options.normal_deviation,
-            correlated=self.correlated,
+            shared=self.observed.modes if self.options.correlated else None,
         )
 
     def _problem(
-        self, points: Cloud, prepared: Prepared, near: SolverResult | Registration, discrepancy_scale: float = 1.0
+        self, points: Cloud, prepared: Prepared, near: SolverResult | Registration
     ) -> Problem:
         """The problem with the model's error in patterns, of the size that belongs to a movement like a trial's."""
         plain = self._plain(points, prepared)
         if self.error is None:
             return plain
         moved = np.linalg.norm(near.evaluation.positions, axis=1).max() + near.rms_distance
-        error = replace(self.error, size=discrepancy_scale * float(moved))
+        error = replace(self.error, size=float(moved))
         return replace(plain, error=error, noise=self.options.noise)
 
     def _cold(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
@@ -443,62 +361,42 @@ class Registrar:
         cold = self._finished(points, prepared, found, begin, is_gathered)
         return cold if known is None or not self._is_late else min(known, cold, key=badness)
 
-    def _sought_anew(self, points: Cloud, near: Registration, begin: float) -> Registration:
-        """From a result that took noise that neighbours share for forces.
-
-        They are not gathered: where noise looks like them, what was found of their place is no belief to build upon.
-        """
-        points, prepared, before = self._enough(points), self._everywhere, near.problem
-        problem = self._plain(points, prepared)
-        start = np.zeros(problem.size)
-        start[problem.force_part] = prepared.forces.nearest(near.unknown_forces)
-        start[problem.pose_part] = near.coefficients[before.pose_part]
-        start[problem.parameter_part] = near.coefficients[before.parameter_part]
-        found = self.options.solver.solve(problem, start, near.evaluation)
-        return self._finished(points, prepared, found, begin)
-
     def _from_rest(self, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> SolverResult:
         """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all."""
         few, first = points.thinned(self.options.localisation.points), prepared.leading(_LEADING)
-        rough, problem = self._plain(few, first), self._plain(points, prepared)
+        rough, problem = self._plain(few, first).unshared, self._plain(points, prepared)
         begun = solver.rough().solve(rough, np.zeros(rough.size))
         start = np.zeros(problem.size)
         start[: first.forces.size] = begun.evaluation.coefficients[rough.force_part]
         start[problem.pose_part] = begun.evaluation.coefficients[rough.pose_part]
         start[problem.parameter_part] = begun.evaluation.coefficients[rough.parameter_part]
-        start[problem.noise_part] = begun.evaluation.coefficients[rough.noise_part]
         if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
             solver = solver.without_steps()
-        return _after(begun, solver.solve(problem, start, begun.evaluation))
+        return _after(begun, solver.solve(problem, start, begun.evaluation, begun.local.eta))
 
     def _finished(
         self, points: Cloud, prepared: Prepared, found: SolverResult, begin: float, is_settled: bool = True
     ) -> Registration:
         """With all points, and with the model's error in patterns, from a result that took it for noise."""
-        solver, discrepancy_scale, is_hopeless = self.options.solver, 1.0, self._is_hopeless(found)
+        solver, is_hopeless = self.options.solver, self._is_hopeless(found)
         if is_hopeless:
             solver = solver.without_steps()
         believed = prepared if self.error is not None else self._believed(prepared, found)
-        problem = self._problem(points, believed, found)
+        problem, before = self._problem(points, believed, found), self._plain(points, prepared)
         is_settled = is_settled and believed is prepared and len(found.evaluation.cloud) == len(points)
         if self.error is not None or not is_settled:
-            errors = np.zeros(problem.size - len(found.evaluation.coefficients))
-            start = np.concatenate([found.evaluation.coefficients, errors])
-            found = _after(found, solver.solve(problem, start, found.evaluation))
+            start = problem.carried(found.evaluation.coefficients, before)
+            found = _after(found, solver.solve(problem, start, found.evaluation, found.local.eta))
         wider = self._believed(believed, found)
         if wider is not believed:  # seen only now that the model's error is told from noise
             believed, problem = wider, replace(problem, forces=wider.forces)
-            found = _after(found, solver.solve(problem, found.evaluation.coefficients, found.evaluation))
-        if not is_hopeless:
-            problem, found, discrepancy_scale = self._doubted(
-                problem, found, discrepancy_scale, self.options.solver.following()
-            )
-        return self._result(problem, found, believed, begin, discrepancy_scale)
+            found = _after(found, solver.solve(problem, found.evaluation.coefficients, found.evaluation, found.local.eta))
+        return self._result(problem, found, believed, begin)
 
     def _believed(self, prepared: Prepared, found: SolverResult) -> Prepared:
         """The forces' size as the cloud tells it, where it can: what was expected would call a sharp pull outliers."""
-        hyperprior, noise = self.options.hyperprior, found.posterior.scales.noise
-        is_told = (noise < hyperprior.clear or noise > hyperprior.loud) and self.correlated is None
+        hyperprior, noise = self.options.hyperprior, found.local.noise
+        is_told = noise < hyperprior.clear or noise > hyperprior.loud
         if not is_told or prepared.forces.scale.spread >= hyperprior.spread:
             return prepared
         return prepared.with_prior(hyperprior.spread)
@@ -506,32 +404,7 @@ class Registrar:
     def _is_hopeless(self, found: SolverResult) -> bool:
         if found.outcome is Outcome.OUT_OF_TIME:  # who knows
             return False
-        return found.posterior.scales.noise > _HOPELESS * self.expectations.noise
-
-    def _doubted(
-        self, problem: Problem, found: SolverResult, discrepancy_scale: float, solver: GaussNewton | LBFGS
-    ) -> tuple[Problem, SolverResult, float]:
-        """Once more where the model's error, or the noise that neighbours share, is larger or smaller than was said."""
-        for _ in range(_DOUBTS):
-            if not found.outcome.is_success:
-                break
-            start, was = found.evaluation.coefficients.copy(), problem
-            if problem.error is not None:
-                factor = _resized(found, problem.error_part)
-                factor = min(max(factor, _LEAST_DOUBT / discrepancy_scale), _MOST_DOUBT / discrepancy_scale)
-                if abs(np.log(factor)) >= _SURE:
-                    discrepancy_scale *= factor
-                    problem = replace(problem, error=replace(problem.error, size=factor * problem.error.size))
-                    start[problem.error_part] /= factor
-            if problem.correlated is not None:
-                factor = _resized(found, problem.noise_part)
-                if np.log(factor) <= -_SURE:  # what is larger is shorter, too: that is looked for from rest
-                    problem = replace(problem, correlated=problem.correlated.resized(factor))
-                    start[problem.noise_part] /= factor
-            if problem is was:
-                break
-            found = _after(found, solver.last().solve(problem, start, found.evaluation))
-        return problem, found, discrepancy_scale
+        return found.local.noise > _HOPELESS * self.expectations.noise
 
     def _gathered(self, nodal: Floats) -> Prepared:
         """The unknown forces once more, where forces were found."""
@@ -539,10 +412,6 @@ class Registrar:
         where = contact(self.forces, nodal, body.points, self.options.localisation.reach * body.size)
         every = self._prepared(localised(self.forces, where))
         return every.informed(self.observed, self.options.localisation.informed)
-
-    def _enough(self, points: Cloud) -> Cloud:
-        """Of points that share noise no more than show it: what its pattern leaves out would be believed of each."""
-        return points if self.correlated is None else points.thinned(_SHARING)
 
     def _is_nearer_at_rest(self, near: Evaluation, start: Registration) -> bool:
         """True where a cloud lies nearer to the body at rest than to what the last frame has found."""
@@ -574,10 +443,9 @@ class Registrar:
         return self.pose.mean, pose.then(self.pose.mean.inverse())
 
     def _result(
-        self, problem: Problem, found: SolverResult, prepared: Prepared, begin: float, discrepancy_scale: float
+        self, problem: Problem, found: SolverResult, prepared: Prepared, begin: float
     ) -> Registration:
-        inflation_factor = found.local.inflation_factor()
-        found = replace(found, posterior=found.local.posterior(inflation_factor))
+        discrepancy_scale = found.local.scales.discrepancy
         evaluation, net = found.evaluation, problem.net_forces(found.evaluation)
         nodal = problem.nodal_forces(evaluation)
         total = nodal.sum(axis=0)
@@ -594,7 +462,6 @@ class Registrar:
             state=state,
             correction=correction + (pose_correction.apply(moved) - moved),
             discrepancy_scale=discrepancy_scale,
-            inflation_factor=inflation_factor,
             pose=pose,
             pose_correction=pose_correction,
             net_force=total,
@@ -606,7 +473,7 @@ class Registrar:
             informed=found.posterior.informed,
             points=len(problem.cloud),
             outcome=found.outcome,
-            judgement=judge(problem, found, state, self.expectations, discrepancy_scale, inflation_factor),
+            judgement=judge(problem, found, state, self.expectations, discrepancy_scale),
             evaluations=found.evaluations,
             seconds=time.perf_counter() - begin,
             trace=found.trace,
@@ -689,30 +556,6 @@ def prepare(
     )
 
 
-def _out_of_time(found: Registration, length: float) -> Registration:
-    """The result, doubtful for noise that there was no time to tell from forces."""
-    return _doubtful(found, length, "and no time was left to tell that from forces")
-
-
-def _of_no_force(found: Registration, length: float) -> Registration:
-    """The result, doubtful for what neighbours share, is too large for noise, and is explained by no force."""
-    why = "by more than noise does: no forces that are expected bring the organ there"
-    return replace(_doubtful(found, length, why), unexplained=length)
-
-
-def _carried(result: Registration, before: Registration) -> Registration:
-    """The result with what the frame before has found of points that err alike, which is not looked for anew."""
-    if before.unexplained > 0.0:
-        result = _of_no_force(result, before.unexplained)
-    return result if before.looked_for == 0 else replace(result, looked_for=before.looked_for + 1)
-
-
-def _doubtful(found: Registration, length: float, why: str) -> Registration:
-    """The result with one reason more: neighbours within a length, metres, err alike."""
-    reason = f"points within {1e3 * length:.0f} mm of each other err alike, {why}"
-    return found.with_check(Check(Code.CORRELATED_NOISE, Verdict.DOUBTFUL, length, None, "m", reason=reason))
-
-
 def _elsewhere(within: float, anywhere: float) -> Check:
     """Whether forces outside the zone explain a cloud better: root mean square distances with both, metres."""
     ratio = anywhere / within
@@ -726,39 +569,6 @@ def _elsewhere(within: float, anywhere: float) -> Check:
     return Check(
         Code.FORCES_ELSEWHERE, verdict, ratio, _EXPLAINED, unit, is_minimum=True, reason=reason if is_better else ""
     )
-
-
-def _resized(found: SolverResult, part: slice) -> float:
-    """Factor by which unknowns of unit variance are larger than was said, or smaller.
-
-    It is MacKay's (1992): the squares of the unknowns over the number that the cloud tells of them.
-    """
-    unknown = found.evaluation.coefficients[part]
-    known = len(unknown) - float(np.diag(found.posterior.covariance)[part].sum())
-    return float(np.sqrt((unknown @ unknown + _BELIEF) / (known + _BELIEF)))
-
-
-def _is_shared(found: Registration, minimum: float) -> bool:
-    """Whether neighbours share of what a cloud has left more than the least noise, and more than chance has them."""
-    match = found.evaluation.match
-    part = shared(found.problem.observed.closest_points(match), match.distances, np.ones(len(match.distances)))
-    return part > _ALIKE and match.rms * np.sqrt(part) > minimum
-
-
-def _noise_of(found: Registration, size: float, length: float) -> CorrelatedNoise:
-    """Noise of a size and a length, metres, for the cloud of a result."""
-    return CorrelatedNoise.over(found.problem.cloud, found.problem.normals(found.evaluation), size, length)
-
-
-def _is_noise(correlated: CorrelatedNoise | None) -> bool:
-    return correlated is not None and is_noise(correlated.size)
-
-
-def _still_there(correlated: CorrelatedNoise | None, points: Cloud) -> CorrelatedNoise | None:
-    """The noise that neighbours shared in the frame before; None for hardly any, or for a cloud that lies elsewhere."""
-    if correlated is None or correlated.size < _GONE * NOISE.minimum or correlated.reaches(points.points) < _REACHED:
-        return None
-    return correlated
 
 
 def _after(first: SolverResult, second: SolverResult) -> SolverResult:

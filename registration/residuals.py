@@ -15,9 +15,12 @@ from softtwin.meshes.closest import ClosestPoints
 from softtwin.meshes.curvature import mean_curvature
 from softtwin.meshes.embedding import outer
 
+from .surface_modes import SurfaceModes, surface_modes
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Distance = Literal["surface", "plane"]
+_MODES = 128  # of the observed side
 _BESIDE = 1.0  # triangles: a point that lies further beside its own is measured to the surface all the same
 
 
@@ -77,6 +80,16 @@ class SurfaceDistance:
         corners = self._carried(field)[self.triangles[match.triangles]]
         found: Floats = np.einsum("pk,pk->p", match.weights, corners)
         return found
+
+    def at_vertices(self, match: Correspondence, field: Floats) -> Floats:
+        """A number of each vertex of the observed side, (v,), at the closest points of a match, (p,)."""
+        found: Floats = np.einsum("pk,pk->p", match.weights, field[self.triangles[match.triangles]])
+        return found
+
+    @cached_property
+    def modes(self) -> SurfaceModes:
+        """The smoothest functions on the observed side at rest."""
+        return surface_modes(self.rest, self.triangles, _MODES)
 
     def match(self, displacement: Floats, cloud: Floats, near: Correspondence | None = None) -> Correspondence:
         """A cloud (p, 3) matched to the surface moved by the displacement (m, 3) of the nodes `nodes`, metres.

@@ -36,7 +36,6 @@ class Registration:
         correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres; with
             it what a pose that was said to be known is off by.
         discrepancy_scale: factor found of the discrepancy's prior standard deviation; 1 where none is known.
-        inflation_factor: how many correlated residuals count as one; 1 where all are independent.
         pose: from the body's coordinates to the cloud's.
         pose_correction: what a pose that was said to be known is off by: a motion in the body's coordinates.
         net_force: (3,), newtons.
@@ -55,9 +54,6 @@ class Registration:
         problem: what was solved, for the cloud and the model's error as they were taken in the end.
         posterior: of the coefficients.
         local: the objective's model there; None for a result that was put together otherwise.
-        looked_for: so many frames on noise that neighbours share was looked for and not found; 0 where it was not.
-        unexplained: neighbours within so much of each other, metres, share more than noise, which no force explains; 0
-            for none.
         draft: what a faster model had found, where this one went on from there.
     """
 
@@ -67,7 +63,6 @@ class Registration:
     state: State
     correction: Floats
     discrepancy_scale: float
-    inflation_factor: float
     pose: Pose
     pose_correction: Pose
     net_force: Floats
@@ -86,8 +81,6 @@ class Registration:
     problem: Problem
     posterior: Posterior
     local: LocalModel | None = None
-    looked_for: int = 0
-    unexplained: float = 0.0
     draft: Registration | None = None
 
     def with_check(self, check: Check) -> Registration:

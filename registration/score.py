@@ -37,13 +37,12 @@ class Score:
         return float(chi2.sf(self.statistic, len(self.estimate)))
 
 
-def score(local: LocalModel, columns: Floats, inflation_factor: float = 1.0) -> Score | None:
+def score(local: LocalModel, columns: Floats) -> Score | None:
     """The test at the end of a registration; None where the cloud tells nothing of the parameters.
 
     Args:
         local: the objective's model there.
         columns: derivative of the distances by the parameters, (p, m).
-        inflation_factor: how many correlated residuals count as one; see `residual_correlation`.
     """
     weights = local.weights / local.deviations**2
     weighted = weights[:, None] * columns
@@ -51,13 +50,13 @@ def score(local: LocalModel, columns: Floats, inflation_factor: float = 1.0) -> 
     solved = local.solved(across)
     information = columns.T @ weighted - across.T @ solved
     # What the last step, which was not taken, would still change of the residuals counts, too.
-    pull = solved.T @ local.gradient - weighted.T @ local.problem.residuals(local.evaluation, local.own)
+    pull = solved.T @ local.gradient - weighted.T @ local.problem.residuals(local.evaluation, local.noise)
     values, vectors = np.linalg.eigh(information)
     scale = np.diag(columns.T @ weighted).max(initial=0.0)
     if not len(values) or not values[0] > np.finfo(float).eps * len(weights) * scale:
         return None
     estimate = vectors @ ((vectors.T @ pull) / values)
-    return Score(estimate, float(pull @ estimate) / inflation_factor)
+    return Score(estimate, float(pull @ estimate))
 
 
 def by_scale(local: LocalModel) -> Floats:

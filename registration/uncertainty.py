@@ -150,11 +150,11 @@ def uncertainty(
     """
     rest = np.zeros(len(problem.observed.body.points))
     if problem.error is not None:
-        rest = problem.error.size * problem.error.discrepancy.rest
+        rest = posterior.scales.discrepancy * problem.error.size * problem.error.discrepancy.rest
     if not np.isfinite(posterior.covariance).all():  # of a cloud that tells nothing that could be believed
         return Uncertainty(np.zeros((3 * len(rest), 1)), np.full(len(rest), np.inf))
     slopes, moving = _by_unknowns(problem, evaluation), np.ones(problem.size, dtype=bool)
-    moving[problem.noise_part] = False
+    moving[problem.error_part.stop :] = False
     if frame == "camera" and problem.pose is not None and evaluation.pose is not None:
         places = problem.observed.body.points + evaluation.state.full.displacement + problem.correction(evaluation)
         slopes, unseen = _turned(evaluation.pose.rotation, slopes), _turned(evaluation.pose.rotation, unseen)
