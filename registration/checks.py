@@ -101,7 +101,6 @@ def judge(
     state: State,
     expected: Expectations,
     discrepancy_scale: float = 1.0,
-    
 ) -> Judgement:
     """The verdict on a solver's result.
 

@@ -1,20 +1,20 @@
 """The hyperparameters of a registration at the maximum of Laplace's evidence, by its gradient.
 
-About a state the residuals are linear in unknowns c, y = B c + noise of covariance sigma^2 W^-1, and c has a normal law
-of variances v(eta) beforehand. The evidence p(y | eta) is that of a normal law with covariance sigma^2 W^-1 + B v B'
-(MacKay 1992), low rank plus diagonal: by Woodbury's formula all of it comes from B' W B, B' W y and y' W y, which are
-made once, and a trial of eta costs the factor of one matrix of the unknowns' size. With m and S the mean and covariance
-of the unknowns,
+About a state the residuals are linear in the unknowns c: y = B c + noise of covariance D W^-1, and c has a normal law
+of variances v beforehand. D, a variance for each group of points, and v depend on the hyperparameters eta. The evidence
+p(y | eta) is that of a normal law with covariance D W^-1 + B v B' (MacKay 1992), diagonal plus low rank: by Woodbury's
+formula all of it comes from B' W B, B' W y and y' W y of each group, which are made once, and a trial of eta costs one
+factor of the unknowns' size. With m and S the mean and the covariance of the unknowns,
 
     d(-log p) / d(log v_j) = (1 - (m_j^2 + S_jj) / v_j) / 2
 
-so that a group of unknowns tells its own scale, however it depends on eta.
+so that a block of unknowns tells its own scale, however that depends on eta, and so does a group of points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,9 +22,13 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.optimize import minimize
 
+from .hyperparameters import LogNormalPrior
+
 Floats = NDArray[np.float64]
-# Logarithms of the variances of all unknowns, (k,), and their derivatives by the logarithms eta, (h, k).
+# Logarithms of variances as functions of the logarithms eta of the hyperparameters, with their derivatives.
 Variances = Callable[[Floats], tuple[Floats, Floats]]
+_DESCENT = {"maxiter": 20, "gtol": 1e-2, "ftol": 1e-7, "maxls": 10}  # of the logarithm of the evidence
+_STEP = 0.02  # of a logarithm, for a difference
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +66,12 @@ class LinearProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
-    """What is believed of the hyperparameters beforehand: independent, log-normal within bounds.
+class Hyperprior:
+    """What is believed of the logarithms of the hyperparameters beforehand: normal and independent, within bounds.
 
     Args:
-        median: logarithms, (h,); the first is that of the noise.
-        spread: standard deviations of the logarithms, (h,); 0 of one that is known.
+        median: (h,).
+        spread: standard deviations, (h,); 0 of one that is known.
         lowest: (h,).
         highest: (h,).
     """
@@ -77,25 +81,34 @@ class Belief:
     lowest: Floats
     highest: Floats
 
-    def with_minimum(self, place: int, value: float) -> Belief:
-        """The same with a larger least value, a logarithm, of one."""
+    @classmethod
+    def of(cls, priors: Sequence[LogNormalPrior]) -> Hyperprior:
+        """The same of the scales themselves."""
+        rows = [(np.clip(each.median, each.minimum, each.maximum), each.minimum, each.maximum) for each in priors]
+        with np.errstate(divide="ignore"):
+            median, lowest, highest = np.log(np.array(rows)).T
+        return cls(median, np.array([each.spread for each in priors]), lowest, highest)
+
+    def with_minimum(self, place: int, value: float) -> Hyperprior:
+        """The same with a larger least value of one."""
         lowest = self.lowest.copy()
         lowest[place] = max(lowest[place], value)
-        return Belief(self.median, self.spread, lowest, np.maximum(self.highest, lowest))
+        return replace(self, lowest=lowest, highest=np.maximum(self.highest, lowest))
 
     @cached_property
-    def free(self) -> NDArray[np.bool_]:
+    def is_sought(self) -> NDArray[np.bool_]:
         """Which are not known, (h,)."""
         return (self.spread > 0.0) & (self.highest > self.lowest)
 
     def within(self, eta: Floats) -> Floats:
-        """Values, those that are known as they are."""
-        return np.clip(np.where(self.spread > 0.0, eta, self.median), self.lowest, self.highest)
+        """Values within the bounds, those that are known as they are."""
+        found: Floats = np.clip(np.where(self.spread > 0.0, eta, self.median), self.lowest, self.highest)
+        return found
 
     def cost(self, eta: Floats) -> tuple[float, Floats]:
         """Minus the logarithm of the density, and its gradient."""
-        off = np.where(self.spread > 0.0, (eta - self.median) / np.where(self.spread > 0.0, self.spread, 1.0), 0.0)
-        return 0.5 * float(off @ off), np.where(self.spread > 0.0, off / np.maximum(self.spread, 1e-300), 0.0)
+        scaled = np.where(self.spread > 0.0, eta - self.median, 0.0) / np.where(self.spread > 0.0, self.spread, 1.0)
+        return 0.5 * float(scaled @ scaled), scaled / np.where(self.spread > 0.0, self.spread, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,21 +118,19 @@ class Evidence:
     Args:
         problem: about a state.
         noise: logarithms of the groups' variances, (g,), and their derivatives, (h, g).
-        variances: of the unknowns.
-        belief: about the hyperparameters.
+        prior: logarithms of the unknowns' variances, (k,), and their derivatives, (h, k).
+        hyperprior: of the hyperparameters.
     """
 
     problem: LinearProblem
     noise: Variances
-    variances: Variances
-    belief: Belief
-    evaluations: list[int] = field(default_factory=lambda: [0])
+    prior: Variances
+    hyperprior: Hyperprior
 
     def value(self, eta: Floats) -> tuple[float, Floats]:
         """At logarithms of the hyperparameters, (h,), with the gradient, (h,)."""
-        self.evaluations[0] += 1
         problem = self.problem
-        (noise, by_noise), (logs, slopes) = self.noise(eta), self.variances(eta)
+        (noise, by_noise), (logs, slopes) = self.noise(eta), self.prior(eta)
         precision, root = np.exp(-noise), np.exp(0.5 * logs)
         matrix, pull = problem.weighted(precision)
         matrix = matrix * root[:, None] * root
@@ -131,7 +142,7 @@ class Evidence:
         inverse, _ = dpotri(factor, lower=True, overwrite_c=True)  # its lower triangle
         inverse = np.tril(inverse) + np.tril(inverse, -1).T
         mean = inverse @ (root * pull)  # over the roots of the variances
-        believed, gradient = self.belief.cost(eta)
+        believed, gradient = self.hyperprior.cost(eta)
         square = float(precision @ (problem.square + problem.tail))
         value = 0.5 * float(problem.count @ noise) + half + 0.5 * (square - float(mean @ (root * pull))) + believed
         gradient = gradient + 0.5 * slopes @ (1.0 - mean**2 - np.diag(inverse))
@@ -142,47 +153,52 @@ class Evidence:
         data = data + problem.information.reshape(len(noise), -1) @ second.ravel()
         return value, gradient + 0.5 * by_noise @ (problem.count - precision * data)
 
-    def maximum(self, starts: list[Floats], tolerance: float = 1e-2, iterations: int = 20) -> Floats:
-        """The most likely hyperparameters, (h,), by descents from several starts.
+    def maximum(self, starts: Sequence[Floats]) -> Floats:
+        """The most likely logarithms of the hyperparameters, (h,): the best of the descents from several starts.
 
         Args:
-            starts: (h,) each.
-            tolerance: of the gradient: a change of the logarithm of the evidence by a logarithm.
-            iterations: of each descent.
+            starts: (h,) each, at least one.
         """
-        belief, free = self.belief, self.belief.free
-        best, lowest = belief.within(starts[0]), np.inf
-        if not free.any():
+        hyperprior, sought = self.hyperprior, self.hyperprior.is_sought
+        best, lowest = hyperprior.within(starts[0]), np.inf
+        if not sought.any():
             return best
+        bounds = np.column_stack([hyperprior.lowest, hyperprior.highest])[sought]
         for start in starts:
-            eta = belief.within(start)
+            eta = hyperprior.within(start)
 
             def cost(part: Floats, eta: Floats = eta) -> tuple[float, Floats]:
-                whole = eta.copy()
-                whole[free] = part
-                value, gradient = self.value(whole)
-                return value, gradient[free]
+                eta[sought] = part
+                value, gradient = self.value(eta)
+                return value, gradient[sought]
 
-            bounds = list(zip(belief.lowest[free], belief.highest[free], strict=True))
-            options = {"maxiter": iterations, "gtol": tolerance, "ftol": 1e-7, "maxls": 10}
-            found = minimize(cost, eta[free], jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+            found = minimize(cost, eta[sought], jac=True, method="L-BFGS-B", bounds=bounds, options=_DESCENT)
             if found.fun < lowest:
                 lowest = float(found.fun)
                 best = eta.copy()
-                best[free] = found.x
+                best[sought] = found.x
         return best
 
-    def curvature(self, eta: Floats, step: float = 0.02) -> Floats:
-        """Covariance of the hyperparameters' logarithms by the curvature at the maximum, (h, h)."""
-        free = np.flatnonzero(self.belief.free)
-        hessian = np.zeros((len(free), len(free)))
-        for row, place in enumerate(free):
-            moved = np.zeros_like(eta)
-            moved[place] = step
-            up, down = self.value(eta + moved)[1], self.value(eta - moved)[1]
-            hessian[row] = (up - down)[free] / (2.0 * step)
-        values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
-        floor = 1.0 / np.maximum(self.belief.spread[free].max(initial=1.0), 1.0) ** 2  # no flatter than the belief
+    def covariance(self, eta: Floats) -> Floats:
+        """Of the logarithms of the hyperparameters, by the curvature at the maximum, (h, h).
+
+        One that lies at a bound is taken as known.
+
+        Args:
+            eta: at the maximum, (h,).
+        """
+        hyperprior = self.hyperprior
+        inside = (eta > hyperprior.lowest + _STEP) & (eta < hyperprior.highest - _STEP)
+        places = np.flatnonzero(hyperprior.is_sought & inside)
         covariance = np.zeros((len(eta), len(eta)))
-        covariance[np.ix_(free, free)] = (vectors / np.maximum(values, floor)) @ vectors.T
+        if not len(places):
+            return covariance
+        here, rows = self.value(eta)[1], []
+        for place in places:
+            moved = eta.copy()
+            moved[place] += _STEP
+            rows.append((self.value(moved)[1] - here)[places] / _STEP)
+        values, vectors = np.linalg.eigh(0.5 * (np.array(rows) + np.array(rows).T))
+        flattest = 1.0 / hyperprior.spread[places].max() ** 2  # what is believed makes it no flatter than that
+        covariance[np.ix_(places, places)] = (vectors / np.maximum(values, flattest)) @ vectors.T
         return covariance

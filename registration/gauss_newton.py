@@ -16,11 +16,11 @@ from softtwin.reference.data.outcome import NotConverged
 
 from . import landmarks
 from .evidence import Evidence, LinearProblem
-from .hyperparameters import Hyperparameters
+from .hyperparameters import DISCREPANCY, LENGTH, NOISE, SHARED, Hyperparameters
 from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .posterior import Posterior
-from .problem import LENGTH, NOISE, SCALE, SIZE, Evaluation, Problem
+from .problem import Evaluation, Problem
 
 Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
@@ -174,15 +174,14 @@ class GaussNewton:
         """
         return _Search(self, problem, start, near, eta).run()
 
-    def has_settled(
-        self, problem: Problem, evaluation: Evaluation, noise: float, eta: Floats | None = None
-    ) -> bool:
+    def has_settled(self, problem: Problem, evaluation: Evaluation, noise: float, eta: Floats | None = None) -> bool:
         """Whether no step would be taken from a trial, its closest points left as they are.
 
         Args:
             problem: what is registered.
             evaluation: where.
             noise: standard deviation of a point's distance as far as it is known, metres.
+            eta: logarithms of the hyperparameters near there, where they are known.
         """
         starts = [] if eta is None else [eta]
         local = LocalModel(problem, evaluation, self.losses[-1], noise, self.graduation, starts=starts)
@@ -231,24 +230,22 @@ class _Search:
         if at is None or at.evaluation is not self.evaluation or at.loss is not loss:
             jacobian = None if at is None or at.evaluation is not self.evaluation else at.jacobian
             starts = self._starts() if at is None or at.loss is not loss else [at.eta]
-            at = LocalModel(
-                self.problem, self.evaluation, loss, self.noise, self.options.graduation, jacobian, starts
-            )
+            at = LocalModel(self.problem, self.evaluation, loss, self.noise, self.options.graduation, jacobian, starts)
             self._at, self.noise, self.eta = at, at.noise, at.eta
         return at
 
     def _starts(self) -> list[Floats]:
         """From where hyperparameters are sought when nothing near is known: without and with noise that is shared."""
-        believed = self.problem.belief.median.copy()
+        believed = self.problem.hyperprior.median.copy()
         if self.eta is not None:
             believed = self.eta.copy()
-        believed[0] = np.log(self.noise)
+        believed[NOISE] = np.log(self.noise)
         if self.problem.shared is None:
             return [believed]
         with_it = believed.copy()
-        with_it[SIZE], with_it[LENGTH] = np.log(self.noise), self.problem.belief.median[LENGTH]
+        with_it[SHARED], with_it[LENGTH] = np.log(self.noise), self.problem.hyperprior.median[LENGTH]
         without = believed.copy()
-        without[SIZE] = self.problem.belief.median[SIZE]
+        without[SHARED] = self.problem.hyperprior.median[SHARED]
         return [without, with_it]
 
     def _descend(self, loss: Loss, settled: float) -> Outcome:
@@ -374,7 +371,7 @@ class LocalModel:
         self.deviations = np.hypot(self.noise, self.scales.discrepancy * self.left_out)
         residuals = problem.residuals(evaluation, self.noise)
         self.weights = loss.weight(residuals / self.deviations)
-        self.precision = np.exp(-problem.variances(self.eta)[0])
+        self.precision = np.exp(-problem.prior_variances(self.eta)[0])
         self.information = self._products(self.weights / self.deviations**2)
         self._hessian = self.information + self.landmark_information + self.normal_information + np.diag(self.precision)
         self.gradient = self._gradient(residuals, self.weights)
@@ -408,25 +405,25 @@ class LocalModel:
             None if isinstance(known, float) else (known, known @ coefficients - self._beside),
         )
         there = np.sqrt([np.mean(self.left_out[group] ** 2) for group in groups])
-        return Evidence(linear, problem.noises(there), problem.variances, problem.belief)
+        return Evidence(linear, problem.noise_variances(there), problem.prior_variances, problem.hyperprior)
 
     def _found(self, noise: float, graduation: float, starts: list[Floats]) -> tuple[Floats, bool]:
-        """Logarithms of the hyperparameters, and whether the noise is held above what the linear model would believe."""
-        evidence = self._evidence(noise, float(np.exp(starts[0][SCALE])) if starts else 1.0)
+        """Logarithms of the hyperparameters, and whether the noise is held above what the model would believe."""
+        evidence = self._evidence(noise, float(np.exp(starts[0][DISCREPANCY])) if starts else 1.0)
         if not starts:
-            start = evidence.belief.median.copy()
-            start[0] = np.log(noise)
+            start = evidence.hyperprior.median.copy()
+            start[NOISE] = np.log(noise)
             starts = [start]
         eta = evidence.maximum(starts)
         minimum = np.log(max(graduation * self._promised(evidence, eta), 1e-300))
-        if minimum <= eta[0]:
+        if minimum <= eta[NOISE]:
             return eta, False
-        held = replace(evidence, belief=evidence.belief.with_minimum(0, minimum))
+        held = replace(evidence, hyperprior=evidence.hyperprior.with_minimum(NOISE, minimum))
         return held.maximum([eta]), True
 
     def _promised(self, evidence: Evidence, eta: Floats) -> float:
         """Root mean square change of the residuals by the best step at some hyperparameters, metres."""
-        linear, root = evidence.problem, np.exp(0.5 * self.problem.variances(eta)[0])
+        linear, root = evidence.problem, np.exp(0.5 * self.problem.prior_variances(eta)[0])
         matrix, pull = linear.weighted(np.exp(-evidence.noise(eta)[0]))
         matrix = root[:, None] * matrix * root + np.eye(len(root))
         step = root * np.linalg.solve(matrix, root * pull) - self.evaluation.coefficients
@@ -527,12 +524,12 @@ class LocalModel:
     def _by_hyperparameters(self, covariance: Floats) -> tuple[Floats, Floats]:
         """Derivative of the mean by the logarithms of the hyperparameters, (k, h), and their covariance, (h, h)."""
         evidence = self._evidence(self.noise, self.scales.discrepancy)
-        _, slopes = self.problem.variances(self.eta)
+        _, slopes = self.problem.prior_variances(self.eta)
         held = self.precision * self.evaluation.coefficients
         columns = (slopes * held).T
         pull = -2.0 * (held + self._beside)
         columns[:, NOISE] = pull
-        return covariance @ columns, evidence.curvature(self.eta)
+        return covariance @ columns, evidence.covariance(self.eta)
 
 
 def _groups(rough: Floats) -> list[NDArray[np.int64]]:

@@ -80,6 +80,7 @@ class LBFGS:
             problem: what is registered.
             start: coefficients to start from, (k,).
             near: a trial whose state is near the start's.
+            eta: without effect.
 
         Raises:
             NotConverged: the model found no state at the start.

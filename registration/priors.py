@@ -22,9 +22,7 @@ from .surface_modes import SurfaceModes
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _SMALLEST_VARIANCE = 1e-5  # of a pattern of forces, relative to the largest: rougher ones are left out
-import os
-_SMOOTHNESS = float(os.environ.get('NU', '1.5'))
-_CARRIED = float(os.environ.get('CARRIED','0.85'))  # of the variance of what patterns of the model's error leave out
+_SMOOTHNESS, _CARRIED = 1.5, 0.9  # of what patterns of the model's error leave out, and part of its variance
 _TANGENTIAL = 0.5  # weight of movements along the observed side: they become normal where it turns
 FORCE = LogNormalPrior(0.01, 2.0, minimum=1e-5)
 
@@ -311,7 +309,6 @@ class ModelError:
         size: largest displacement that is reckoned with, metres.
         rest_modes: of the observed side, in which what the patterns leave out varies over it.
         rest_logs: logarithms of their variances, for a field of unit variance.
-        rest_beyond: part of its variance that changes over less than these show.
     """
 
     discrepancy: Discrepancy
@@ -320,13 +317,13 @@ class ModelError:
     size: float
     rest_modes: SurfaceModes
     rest_logs: Floats
-    rest_beyond: float
 
     @classmethod
     def of(cls, discrepancy: Discrepancy, observed: SurfaceDistance) -> ModelError:
         """For a largest displacement of one metre.
 
-        A field of length l on an area A is independent at 4 A / (3 pi l^2) places (tr(C)^2 / tr(C^2) in its modes).
+        A field of Matérn's covariance on an area A is independent at (2 nu + 1) A kappa^2 / (4 pi nu^2) places, where
+        kappa^2 = 2 nu / l^2: that is tr(C)^2 / tr(C^2) in its modes.
 
         Args:
             discrepancy: of the model.
@@ -335,7 +332,9 @@ class ModelError:
         nodes, whole = observed.nodes, outer(observed.body).rest
         rows = (3 * nodes[:, None] + np.arange(3)).ravel()
         corners = whole.points[whole.triangles]
-        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+        area = (
+            0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+        )
         modes = observed.modes
         nu = _SMOOTHNESS
         base = 4.0 * np.pi * nu**2 * discrepancy.places / ((2.0 * nu + 1.0) * area)
@@ -343,8 +342,7 @@ class ModelError:
         carried = np.cumsum(np.exp(logs))
         kept = min(len(logs), 1 + int(np.searchsorted(carried, _CARRIED)))
         patterns = np.ascontiguousarray(discrepancy.modes[rows])
-        beyond = max(1.0 - float(carried[kept - 1]), 0.0)
-        return cls(discrepancy, patterns, discrepancy.rest[nodes], 1.0, modes.leading(kept), logs[:kept], float(os.environ.get('BEYOND', beyond)))
+        return cls(discrepancy, patterns, discrepancy.rest[nodes], 1.0, modes.leading(kept), logs[:kept])
 
     @property
     def count(self) -> int:

@@ -12,24 +12,18 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from .cloud import Cloud
-from .evidence import Belief, Variances
+from .evidence import Hyperprior, Variances
 from .forward import ParametrisedModel, ParametrisedState, ReducedModel, ReducedState
-from .hyperparameters import LogNormalPrior
+from .hyperparameters import DISCREPANCY, FORCE, LENGTH, NOISE, SHARED, LogNormalPrior
 from .landmarks import LandmarkPairs
 from .parameter_blocks import ParameterBlocks
+from .policy import POLICY
 from .pose import Pose
 from .priors import ModelError, NodalForces, PosePrior
 from .residuals import Correspondence, SurfaceDistance
 from .surface_modes import SurfaceModes
 
 Floats = NDArray[np.float64]
-import os
-
-NOISE, FORCE, SIZE, LENGTH, SCALE = range(5)  # places of the hyperparameters
-_SIZE, _SIZE_SPREAD, _LARGEST = 2e-6, 3.0, 5e-3  # metres: of shared noise; none, unless the cloud says so
-_LENGTH, _LENGTH_SPREAD, _LONGEST = 0.15, 0.5, 3.0  # of the root of the area; times the median
-_EDGES = 1.75  # of the surface: the shortest length
-_SCALE_SPREAD, _LEAST_SCALE, _MOST_SCALE = float(os.environ.get("SSP","0.25")), float(os.environ.get("LEAST","1")), 10.0  # of the model's error
 _WATCHED = 300  # nodes whose movement limits a step
 # Radians, of a measured normal across itself: cameras' are off by some 10 degrees, and flat triangles by some more.
 NORMAL_DEVIATION = float(np.deg2rad(10.0))
@@ -156,7 +150,7 @@ class Problem:
         return self.observed.at_vertices(evaluation.match, field)
 
     def left_out(self, evaluation: Evaluation) -> Floats:
-        """The part of the distances that is taken for what the patterns of the model's error leave out, (p,), metres."""
+        """The part of the distances that is taken for what patterns of the model's error leave out, (p,), metres."""
         if self.error is None:
             return np.zeros(len(self.cloud))
         field = self.error.rest_modes.modes @ evaluation.coefficients[self.rest_part]
@@ -164,11 +158,15 @@ class Problem:
         return there * self.observed.at_vertices(evaluation.match, field)
 
     def rough(self, evaluation: Evaluation) -> Floats:
-        """Standard deviation of each distance by what changes from point to point of it, (p,), metres."""
+        """Standard deviation of each distance by what the model gets wrong from point to point, (p,), metres.
+
+        What its patterns leave out changes over some edges of the mesh, less than points of a cloud lie apart.
+        """
         if self.error is None:
             return np.zeros(len(self.cloud))
-        there = self.observed.at_points(evaluation.match, self.error.rest)
-        return float(os.environ.get('BEYOND','3'))**.5*there
+        along = np.sqrt(POLICY.discrepancy_along_normal)
+        found: Floats = along * self.observed.at_points(evaluation.match, self.error.rest)
+        return found
 
     def _by_distances(self, evaluation: Evaluation) -> Floats:
         """Derivative of the residuals by the coefficients that change the distances alone, (p, q)."""
@@ -198,47 +196,52 @@ class Problem:
         return start
 
     @cached_property
-    def belief(self) -> Belief:
-        """Of the logarithms of the hyperparameters: noise, forces, size and length of shared noise, model's error."""
-        length = np.sqrt(1.0 if self.shared is None else self.shared.area) * _LENGTH
-        shortest = 1e-9 if self.shared is None else _EDGES * self.observed.edge
-        rows = (
-            (self.noise.median, self.noise.spread, max(self.noise.minimum, 1e-9), np.inf),
-            (self.forces.scale.median, self.forces.scale.spread if self.forces.size else 0.0, max(self.forces.scale.minimum, 1e-300), np.inf),
-            (_SIZE, _SIZE_SPREAD if self.shared is not None else 0.0, 1e-9, _LARGEST),
-            (max(length, shortest), _LENGTH_SPREAD if self.shared is not None else 0.0, shortest, _LONGEST * length),
-            (1.0, 0.0 if self.error is None else _SCALE_SPREAD, _LEAST_SCALE, _MOST_SCALE),
-        )
-        median, spread, lowest, highest = (np.array(column) for column in zip(*rows, strict=True))
-        return Belief(np.log(np.maximum(median, lowest)), spread, np.log(lowest), np.log(highest))
+    def hyperprior(self) -> Hyperprior:
+        """What is believed of the hyperparameters, in their order."""
+        never = LogNormalPrior(1.0, 0.0)
+        scale = self.forces.scale
+        priors = [self.noise, scale if self.forces.size else replace(scale, spread=0.0), never, never, never]
+        if self.shared is not None:
+            least = POLICY.shared_length_least * self.observed.edge
+            median = max(POLICY.shared_length * np.sqrt(self.shared.area), least)
+            longest = POLICY.shared_length_most * median
+            priors[SHARED] = LogNormalPrior(
+                POLICY.shared_size, POLICY.shared_size_spread, maximum=POLICY.shared_size_most
+            )
+            priors[LENGTH] = LogNormalPrior(median, POLICY.shared_length_spread, least, longest)
+        if self.error is not None:
+            priors[DISCREPANCY] = LogNormalPrior(
+                1.0, POLICY.discrepancy_spread, POLICY.discrepancy_least, POLICY.discrepancy_most
+            )
+        return Hyperprior.of(priors)
 
-    def noises(self, rough: Floats) -> Variances:
-        """Variances of points beside which the model's error is rough, as functions of the hyperparameters.
+    def noise_variances(self, rough: Floats) -> Variances:
+        """Of points beside which the model's error changes from one to the next.
 
         Args:
-            rough: standard deviation of a distance by that, (g,), metres.
+            rough: standard deviation of a distance by that, (g,), metres; see `rough`.
         """
 
         def found(eta: Floats) -> tuple[Floats, Floats]:
-            own, beside = np.exp(2.0 * eta[NOISE]), np.exp(2.0 * eta[SCALE]) * rough**2
+            own, beside = np.exp(2.0 * eta[NOISE]), np.exp(2.0 * eta[DISCREPANCY]) * rough**2
             slopes = np.zeros((len(eta), len(rough)))
-            slopes[NOISE], slopes[SCALE] = 2.0 * own / (own + beside), 2.0 * beside / (own + beside)
+            slopes[NOISE], slopes[DISCREPANCY] = 2.0 * own / (own + beside), 2.0 * beside / (own + beside)
             return np.log(own + beside), slopes
 
         return found
 
-    def variances(self, eta: Floats) -> tuple[Floats, Floats]:
+    def prior_variances(self, eta: Floats) -> tuple[Floats, Floats]:
         """Logarithms of the coefficients' variances beforehand, (k,), and their derivatives by eta, (5, k)."""
         logs, slopes = np.zeros(self.size), np.zeros((len(eta), self.size))
         logs[self.force_part], slopes[FORCE, self.force_part] = 2.0 * eta[FORCE], 2.0
         if self.error is not None:
-            logs[self.error_part], slopes[SCALE, self.error_part] = 2.0 * eta[SCALE], 2.0
-            logs[self.rest_part] = self.error.rest_logs + 2.0 * eta[SCALE]
-            slopes[SCALE, self.rest_part] = 2.0
+            logs[self.error_part.start : self.rest_part.stop] = 2.0 * eta[DISCREPANCY]
+            logs[self.rest_part] += self.error.rest_logs
+            slopes[DISCREPANCY, self.error_part.start : self.rest_part.stop] = 2.0
         if self.shared is not None:
             spread, by_length = self.shared.spread(float(np.exp(eta[LENGTH])))
-            logs[self.noise_part] = 2.0 * eta[SIZE] + spread
-            slopes[SIZE, self.noise_part], slopes[LENGTH, self.noise_part] = 2.0, by_length
+            logs[self.noise_part] = 2.0 * eta[SHARED] + spread
+            slopes[SHARED, self.noise_part], slopes[LENGTH, self.noise_part] = 2.0, by_length
         return logs, slopes
 
     def evaluation(self, coefficients: Floats, near: Evaluation | None = None, *, anew: bool = False) -> Evaluation:
@@ -292,7 +295,7 @@ class Problem:
         return self.error.field(evaluation.coefficients[self.error_part])
 
     def residuals(self, evaluation: Evaluation, noise: float) -> Floats:
-        """Distances less what they are in the mean for points of some noise, and less what neighbours share, (p,), metres.
+        """Distances less what they are in the mean for points of some noise, and what neighbours share, (p,), metres.
 
         Args:
             evaluation: at some coefficients.

@@ -27,6 +27,7 @@ from .manifold_mapping import ManifoldMapping
 from .options import RegistrationOptions
 from .outcome import Outcome
 from .parameter_blocks import ParameterBlocks
+from .policy import POLICY
 from .pose import Pose
 from .prepared import Prepared
 from .priors import (
@@ -45,30 +46,14 @@ from .result import Registration, badness
 from .verdict import Check, Code, Verdict
 
 Floats = NDArray[np.float64]
-# Of the logarithm of a nodal force: with more, forces explain noise and the model's error. Without either, a pull at a
-# few nodes makes it many times what was expected.
-_SPREAD = 0.35
 _FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
 _GLANCE = 100  # points that this is seen from
 _LEFT = 1.5  # times the noise of the frame before
 _SEARCHING = 0.7  # of the time that is left for a frame: the search from rest, whose end takes the others
-_DOUBTS, _SURE = 3, 0.1  # times that the model's error is scaled anew; not where that changes it by less
 _MISSED, _EXPLAINED = 1.0, 0.5  # times the least noise, shared by neighbours; part of it that forces anywhere leave
-_ALIKE = 0.2  # part of what a cloud has left that neighbours share: with less, nobody asks for correlated noise
-_A_TRY, _WORTH = -3.0, 5.0  # of the logarithm of the odds of correlated noise: for a try, and to be believed
-_EDGES = 1.75  # of the surface: a shorter length is none of noise that forces follow
-_AGAIN = 50  # frames on, what was not found is looked for again
-_TRIES, _SAME = 3, 0.15  # of finding its size and length; of their logarithms, less than which is no change
-_SHARING = 1000  # points: of more, that share noise, nothing more is learned
-_REACHED = 0.8  # part of a cloud that the noise of the frame before must reach
-_GONE = 1.0  # times the least noise: correlated noise that small is not looked for in the next frame
-_BELIEF = 4.0  # unknowns' worth of belief that the model's error is what its samples said
-_LEAST_DOUBT, _MOST_DOUBT = 0.5, 10.0
 _HOPELESS = 1.25  # times the largest noise expected: no more time is spent
 _LEADING = 6  # directions of force that a cold start begins with
 _ANCHORS = 3  # exact states from which a fast model goes on
-
-
 
 
 class Registrar:
@@ -193,7 +178,11 @@ class Registrar:
             now = time.monotonic()
             hurried = self.limited(now + _SEARCHING * (self.options.solver.until - now))
             other = hurried._cold(points, begin, result)
-            return other if other is result else replace(min(other, result, key=badness), seconds=time.perf_counter() - begin)
+            return (
+                other
+                if other is result
+                else replace(min(other, result, key=badness), seconds=time.perf_counter() - begin)
+            )
         return result
 
     def _followed(self, points: Cloud, start: Registration, begin: float) -> Registration:
@@ -331,9 +320,7 @@ class Registrar:
             shared=self.observed.modes if self.options.correlated else None,
         )
 
-    def _problem(
-        self, points: Cloud, prepared: Prepared, near: SolverResult | Registration
-    ) -> Problem:
+    def _problem(self, points: Cloud, prepared: Prepared, near: SolverResult | Registration) -> Problem:
         """The problem with the model's error in patterns, of the size that belongs to a movement like a trial's."""
         plain = self._plain(points, prepared)
         if self.error is None:
@@ -390,7 +377,9 @@ class Registrar:
         wider = self._believed(believed, found)
         if wider is not believed:  # seen only now that the model's error is told from noise
             believed, problem = wider, replace(problem, forces=wider.forces)
-            found = _after(found, solver.solve(problem, found.evaluation.coefficients, found.evaluation, found.local.eta))
+            found = _after(
+                found, solver.solve(problem, found.evaluation.coefficients, found.evaluation, found.local.eta)
+            )
         return self._result(problem, found, believed, begin)
 
     def _believed(self, prepared: Prepared, found: SolverResult) -> Prepared:
@@ -442,9 +431,7 @@ class Registrar:
             return pose, Pose.identity()
         return self.pose.mean, pose.then(self.pose.mean.inverse())
 
-    def _result(
-        self, problem: Problem, found: SolverResult, prepared: Prepared, begin: float
-    ) -> Registration:
+    def _result(self, problem: Problem, found: SolverResult, prepared: Prepared, begin: float) -> Registration:
         discrepancy_scale = found.local.scales.discrepancy
         evaluation, net = found.evaluation, problem.net_forces(found.evaluation)
         nodal = problem.nodal_forces(evaluation)
@@ -517,7 +504,7 @@ def prepare(
     """
     options = options or RegistrationOptions()
     observed = SurfaceDistance(model.body, triangles, options.distance)
-    scale = LogNormalPrior(force_scale, _SPREAD, minimum=1e-2 * force_scale)
+    scale = LogNormalPrior(force_scale, POLICY.force_spread, minimum=1e-2 * force_scale)
     if nodes is None:
         if parameter_blocks is None and pose is None:
             raise ValueError("prepare.nodes: expected nodes that may carry force where nothing else is unknown.")

@@ -15,12 +15,12 @@ from softtwin.meshes.closest import ClosestPoints
 from softtwin.meshes.curvature import mean_curvature
 from softtwin.meshes.embedding import outer
 
+from .policy import POLICY
 from .surface_modes import SurfaceModes, surface_modes
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Distance = Literal["surface", "plane"]
-_MODES = 128  # of the observed side
 _BESIDE = 1.0  # triangles: a point that lies further beside its own is measured to the surface all the same
 
 
@@ -89,7 +89,7 @@ class SurfaceDistance:
     @cached_property
     def modes(self) -> SurfaceModes:
         """The smoothest functions on the observed side at rest."""
-        return surface_modes(self.rest, self.triangles, _MODES)
+        return surface_modes(self.rest, self.triangles, POLICY.surface_modes)
 
     def match(self, displacement: Floats, cloud: Floats, near: Correspondence | None = None) -> Correspondence:
         """A cloud (p, 3) matched to the surface moved by the displacement (m, 3) of the nodes `nodes`, metres.
