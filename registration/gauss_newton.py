@@ -211,7 +211,8 @@ class _Search:
     def run(self) -> SolverResult:
         options = self.options
         ended = [self._descend(loss, options.handed_on) for loss in options.losses[:-1]]
-        if self.problem is not self.whole:
+        if self.problem is not self.whole:  # first what points far off are told by, then what neighbours share
+            ended.append(self._descend(options.losses[-1], options.settled))
             self.problem, self._at = self.whole, None
             grown = np.zeros(self.whole.size)
             grown[: len(self.evaluation.coefficients)] = self.evaluation.coefficients

@@ -15,6 +15,7 @@ from softtwin.meshes.embedding import outer, outer_nodes
 
 from .forward import Discrepancy, ReducedModel
 from .hyperparameters import LogNormalPrior
+from .policy import POLICY
 from .pose import Pose
 from .residuals import SurfaceDistance
 from .surface_modes import SurfaceModes
@@ -353,6 +354,12 @@ class ModelError:
     def rest(self) -> Floats:
         """Standard deviation of an observed node's distance by what the modes leave out, (p,), metres."""
         return self.size * self.left_out
+
+    @cached_property
+    def across(self) -> Floats:
+        """The same of a distance to the surface, where all three components of it lie across that, (p,), metres."""
+        found: Floats = np.sqrt(POLICY.discrepancy_along_normal) * self.rest
+        return found
 
     def jacobian(self, rows: csr_array | Floats) -> Floats:
         """Derivative of linear functions of the observed nodes' displacement, (q, m), for rows (q, 3p)."""

@@ -154,7 +154,7 @@ class Problem:
         if self.error is None:
             return np.zeros(len(self.cloud))
         field = self.error.rest_modes.modes @ evaluation.coefficients[self.rest_part]
-        there = self.observed.at_points(evaluation.match, self.error.rest)
+        there = self.observed.at_points(evaluation.match, self.error.across)
         return there * self.observed.at_vertices(evaluation.match, field)
 
     def rough(self, evaluation: Evaluation) -> Floats:
@@ -164,16 +164,14 @@ class Problem:
         """
         if self.error is None:
             return np.zeros(len(self.cloud))
-        along = np.sqrt(POLICY.discrepancy_along_normal)
-        found: Floats = along * self.observed.at_points(evaluation.match, self.error.rest)
-        return found
+        return self.observed.at_points(evaluation.match, self.error.across)
 
     def _by_distances(self, evaluation: Evaluation) -> Floats:
         """Derivative of the residuals by the coefficients that change the distances alone, (p, q)."""
         match, columns = evaluation.match, [np.zeros((len(self.cloud), 0))]
         corners = self.observed.triangles[match.triangles]
         if self.error is not None:
-            there = self.observed.at_points(match, self.error.rest)
+            there = self.observed.at_points(match, self.error.across)
             columns.append(-there[:, None] * self.error.rest_modes.at(corners, match.weights))
         if self.shared is not None:
             columns.append(-self.shared.at(corners, match.weights))
