@@ -185,9 +185,8 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
     correction = pose_correction_of(result)
     if correction is not None:
         row["pose_correction"] = correction
-    shared = None
-    if shared is not None:
-        row["shared_noise"] = {"size_m": shared.size, "length_m": shared.length}
+    if result.shared_noise is not None:
+        row["shared_noise"] = dict(zip(("size_m", "length_m"), result.shared_noise, strict=True))
     if result.estimates:
         row["estimates"] = [asdict(estimate) for estimate in result.estimates]
     if deviation.any():  # there are unknown forces

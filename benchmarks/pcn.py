@@ -5,10 +5,10 @@
     python benchmarks/pcn.py FOLDER [--frames 10] [--length 20000] [--about laplace]
 
 Fresh states of the quickstart's organ and clouds of 1,000 points as in margins.py, no zone told, from rest. The chain
-has the coefficients of forces and model error, whitened by their prior, and the likelihood that the registration ended
-with: its robust loss at the noise and the force scale that were found, divided by how many points tell what one would.
-Laplace's law is taken at the same scales, so that the two differ by what is not linear alone (the doubt of the force
-scale, which the product adds, is in neither). pCN proposes from the prior (--about prior: Cotter et al. 2013), whose
+has all coefficients, of forces, model error and noise that neighbours share, whitened by their prior, and the
+likelihood that the registration ended with: its robust loss, with the hyperparameters that were found. Laplace's law is
+taken at the same ones, so that the two differ by what is not linear alone (the doubt of the hyperparameters, which the
+product adds, is in neither). pCN proposes from the prior (--about prior: Cotter et al. 2013), whose
 steps are as short as the sharpest direction asks; about Laplace's law (Rudolf and Sprungk 2018) it has the same target,
 and a state tells far more.
 """
@@ -42,7 +42,7 @@ QUANTITIES = ("net force", "mean displacement")
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """What is known of the coefficients after a cloud, without normals or landmarks, at scales that are held.
+    """What is known of the coefficients after a cloud, without normals, landmarks or a pose, at hyperparameters that are held.
 
     Args:
         problem: what was registered.
@@ -50,7 +50,6 @@ class Law:
         scale: standard deviation of each coefficient beforehand, (k,).
         noise: found, metres.
         deviations: of the points, (p,), metres.
-        inflation_factor: so many points tell what one would.
         loss: of each.
     """
 
@@ -59,22 +58,20 @@ class Law:
     scale: Floats
     noise: float
     deviations: Floats
-    inflation_factor: float
     loss: Loss
 
     @classmethod
     def of(cls, found: Registration, loss: Loss | None = None) -> Law:
-        """At the scales of a registration's posterior."""
-        problem, scales = found.problem, found.posterior.scales
-        scale = np.ones(problem.size)
-        scale[problem.force_part] = scales.force
-        deviations = np.hypot(scales.noise, problem.left_out(found.evaluation))
-        return cls(problem, found.evaluation, scale, scales.noise, deviations, found.inflation_factor, loss or Tukey())
+        """At the hyperparameters of a registration's end."""
+        local = found.local
+        assert local is not None  # it was registered
+        scale = 1.0 / np.sqrt(local.precision)
+        return cls(found.problem, found.evaluation, scale, local.noise, local.deviations, loss or Tukey())
 
     def log_likelihood(self, whitened: Floats) -> float:
         """Of coefficients over their scales beforehand, (k,), up to a constant."""
         scaled = self.problem.residuals(self._trial(whitened), self.noise) / self.deviations
-        return -float(self.loss.value(scaled).sum()) / self.inflation_factor
+        return -float(self.loss.value(scaled).sum())
 
     def _trial(self, whitened: Floats) -> Evaluation:
         return self.problem.evaluation(self.scale * whitened, self.evaluation)
@@ -87,7 +84,7 @@ class Law:
     def covariance(self) -> Floats:
         """Laplace's, whitened, (k, k), with the weights that the product's has."""
         scaled = self.problem.residuals(self.evaluation, self.noise) / self.deviations
-        trusted = np.sqrt(self.loss.weight(scaled) / self.inflation_factor) / self.deviations
+        trusted = np.sqrt(self.loss.weight(scaled)) / self.deviations
         slopes = trusted[:, None] * self.problem.jacobian(self.evaluation) * self.scale
         return np.linalg.inv(slopes.T @ slopes + np.eye(len(self.scale)))
 
@@ -102,12 +99,14 @@ class Law:
 
     def slopes(self) -> Floats:
         """Their derivative by the whitened coefficients at the mode, (6, k)."""
-        pushed = self.evaluation.state.full.jvp(self.problem.forces.basis)
-        blocks = [pushed.reshape(-1, 3, pushed.shape[1]).mean(axis=0)]
-        if self.problem.error is not None:
-            modes = self.problem.error.size * self.problem.error.discrepancy.modes
-            blocks.append(modes.reshape(-1, 3, modes.shape[1]).mean(axis=0))
-        return np.vstack([self.problem.net_forces(self.evaluation), np.hstack(blocks)]) * self.scale
+        problem = self.problem
+        pushed = self.evaluation.state.full.jvp(problem.forces.basis)
+        mean = np.zeros((3, problem.size))  # what the patterns leave out, and noise, move no node
+        mean[:, problem.force_part] = pushed.reshape(-1, 3, pushed.shape[1]).mean(axis=0)
+        if problem.error is not None:
+            modes = problem.error.size * problem.error.discrepancy.modes
+            mean[:, problem.error_part] = modes.reshape(-1, 3, modes.shape[1]).mean(axis=0)
+        return np.vstack([problem.net_forces(self.evaluation), mean]) * self.scale
 
 
 @dataclass(frozen=True, eq=False)

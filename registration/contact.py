@@ -161,7 +161,7 @@ class ContactRegistrar:
         draft = replace(draft, draft=draft)
         if not draft.judgement.is_usable:
             return replace(draft, seconds=time.perf_counter() - begin)
-        found = self._registrar(draft).with_prior(draft.problem.correlated).register(cloud)
+        found = self._registrar(draft).register(cloud)
         minimum = max(draft.scatter, self.anywhere.noise.minimum)
         is_worse = found.scatter > _WORSE * minimum
         reason = (
@@ -187,9 +187,9 @@ class ContactRegistrar:
         middle = sizes**2 @ body.points[nodes] / max(float(sizes @ sizes), 1e-300)
         size = self.patch.force or max(float(np.linalg.norm(draft.net_force)), 1e-12)
         contact = Contact(nodes, middle, _REACH * body.size, self.patch.radius, size)
-        # What neighbours are missed by alike is for forces anywhere to tell: here it would hide a second contact.
+        # What neighbours are missed by alike is for forces anywhere to tell: here it could hide a second contact.
         localisation = replace(anywhere.options.localisation, rounds=0)
-        options = replace(anywhere.options, localisation=localisation, correlated=False)
+        options = replace(anywhere.options, localisation=localisation, correlated=draft.shared_noise is not None)
         return Registrar(
             anywhere.model,
             anywhere.observed,

@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 Variances = Callable[[Floats], tuple[Floats, Floats]]
 _DESCENT = {"maxiter": 20, "gtol": 1e-2, "ftol": 1e-7, "maxls": 10}  # of the logarithm of the evidence
 _STEP = 0.02  # of a logarithm, for a difference
+_REACH = 20.0  # spreads: nobody believes in more, and beyond it exponentials overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,9 @@ class Hyperprior:
         rows = [(np.clip(each.median, each.minimum, each.maximum), each.minimum, each.maximum) for each in priors]
         with np.errstate(divide="ignore"):
             median, lowest, highest = np.log(np.array(rows)).T
-        return cls(median, np.array([each.spread for each in priors]), lowest, highest)
+        spread = np.array([each.spread for each in priors])
+        reach = np.where(spread > 0.0, _REACH * spread, np.inf)
+        return cls(median, spread, np.maximum(lowest, median - reach), np.minimum(highest, median + reach))
 
     def with_minimum(self, place: int, value: float) -> Hyperprior:
         """The same with a larger least value of one."""

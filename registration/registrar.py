@@ -192,7 +192,7 @@ class Registrar:
         if self._is_nearer_at_rest(near, start):  # the tool has let go: no way back through all states between
             found = self._from_rest(points, start.prepared, self.options.solver)
             return self._finished(points, start.prepared, found, begin)
-        found = self.options.solver.following().solve(problem, near.coefficients, near, start.local.eta)
+        found = self.options.solver.following().solve(problem, near.coefficients, near, start.eta)
         return self._result(problem, found, start.prepared, begin)
 
     @property
@@ -237,18 +237,18 @@ class Registrar:
         start[problem.force_part] = prepared.forces.nearest(draft.unknown_forces)
         start[problem.pose_part] = draft.coefficients[draft.problem.pose_part]
         start[problem.noise_part] = draft.coefficients[draft.problem.noise_part]
-        found = self._approached(problem, problem.begun(start, draft.evaluation), fast, solver, draft.local.eta)
+        found = self._approached(problem, problem.begun(start, draft.evaluation), fast, solver, draft.eta)
         return self._finished(points, prepared, found, begin)
 
     def _carried_on(self, points: Cloud, fast: ForwardModel, last: Registration, begin: float) -> Registration:
         problem = self._problem(points, last.prepared, last)
         solver = self.options.solver.following()
         near = replace(last.evaluation, coefficients=problem.carried(last.evaluation.coefficients, last.problem))
-        found = self._approached(problem, near, fast, solver, last.local.eta)
+        found = self._approached(problem, near, fast, solver, last.eta)
         return self._result(problem, found, last.prepared, begin)
 
     def _approached(
-        self, problem: Problem, near: Evaluation, fast: ForwardModel, solver: GaussNewton | LBFGS, eta: Floats
+        self, problem: Problem, near: Evaluation, fast: ForwardModel, solver: GaussNewton | LBFGS, eta: Floats | None
     ) -> SolverResult:
         """The minimum, to which the fast model knows most of the way from any trial of the exact one.
 

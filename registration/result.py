@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from .forward import State
 from .gauss_newton import IterationRecord, LocalModel
 from .loss import REJECTED
+from .options import NOISE
 from .outcome import Outcome
 from .parameter_blocks import Estimate
 from .pose import Pose
@@ -91,6 +92,18 @@ class Registration:
     def coefficients(self) -> Floats:
         """Of forces, pose, conditions and model error, (k,)."""
         return self.evaluation.coefficients
+
+    @property
+    def eta(self) -> Floats | None:
+        """Logarithms of the hyperparameters found, (5,); None for a result that was put together otherwise."""
+        return None if self.local is None else self.local.eta
+
+    @property
+    def shared_noise(self) -> tuple[float, float] | None:
+        """Size and length of the noise that neighbours share, metres; None where it is less than any camera's."""
+        if self.local is None or self.problem.shared is None or self.local.scales.shared < NOISE.minimum:
+            return None
+        return self.local.scales.shared, self.local.scales.length
 
     @cached_property
     def scatter(self) -> float:

@@ -178,7 +178,6 @@ def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[s
                 state=state,  # type: ignore[arg-type]
                 correction=np.zeros_like(shape),
                 discrepancy_scale=1.0,
-                inflation_factor=1.0,
                 pose=Pose.identity(),
                 pose_correction=Pose.identity(),
                 net_force=np.array([0.0, 0.3, 0.4]),
@@ -194,7 +193,7 @@ def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[s
                 evaluations=5,
                 seconds=0.1,
                 trace=(),
-                problem=SimpleNamespace(correlated=None, pose=None),  # type: ignore[arg-type]
+                problem=SimpleNamespace(shared=None, pose=None),  # type: ignore[arg-type]
                 posterior=None,  # type: ignore[arg-type]
             )
             vars(result).update(

