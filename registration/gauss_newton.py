@@ -369,7 +369,7 @@ class LocalModel:
         self.eta, self.is_graduated = self._found(noise, graduation, list(starts))
         self.scales = Hyperparameters(*np.exp(self.eta))
         self.noise = self.scales.noise
-        self.deviations = np.hypot(self.noise, self.scales.discrepancy * self.left_out)
+        self.deviations = np.hypot(self.noise, self.left_out)
         residuals = problem.residuals(evaluation, self.noise)
         self.weights = loss.weight(residuals / self.deviations)
         self.precision = np.exp(-problem.prior_variances(self.eta)[0])
@@ -391,7 +391,7 @@ class LocalModel:
         """Of the hyperparameters, with the weights that the points have at some noise, metres, and model error."""
         problem, coefficients = self.problem, self.evaluation.coefficients
         residuals = problem.residuals(self.evaluation, noise)
-        weights = self.loss.weight(residuals / np.hypot(noise, rough * self.left_out))
+        weights = self.loss.weight(residuals / np.hypot(noise, self.left_out))
         data = self.jacobian @ coefficients - residuals
         known = self.landmark_information + self.normal_information
         groups = _groups(self.left_out)

@@ -53,13 +53,13 @@ class Policy:
         128, "", "modes of the observed side in which it is described", "fields of 18 mm on the liver's visible side"
     )
     discrepancy_spread: float = choice(
-        0.25,
+        0.5,
         "",
         "standard deviation of the logarithm of what the model gets wrong over what it was seen to",
         "robustness, surrogate: noise 1 mm; with 0.5 its error is 8 % larger",
     )
     discrepancy_least: float = choice(
-        1.0,
+        0.3,
         "times what was seen",
         "least of it: a cloud that happens to fit better proves nothing",
         "robustness, surrogate: clean; with 0.5 only 63 % of the nodes lie in 90 % margins",

@@ -221,9 +221,9 @@ class Problem:
         """
 
         def found(eta: Floats) -> tuple[Floats, Floats]:
-            own, beside = np.exp(2.0 * eta[NOISE]), np.exp(2.0 * eta[DISCREPANCY]) * rough**2
+            own, beside = np.exp(2.0 * eta[NOISE]), rough**2
             slopes = np.zeros((len(eta), len(rough)))
-            slopes[NOISE], slopes[DISCREPANCY] = 2.0 * own / (own + beside), 2.0 * beside / (own + beside)
+            slopes[NOISE] = 2.0 * own / (own + beside)
             return np.log(own + beside), slopes
 
         return found
@@ -233,9 +233,8 @@ class Problem:
         logs, slopes = np.zeros(self.size), np.zeros((len(eta), self.size))
         logs[self.force_part], slopes[FORCE, self.force_part] = 2.0 * eta[FORCE], 2.0
         if self.error is not None:
-            logs[self.error_part.start : self.rest_part.stop] = 2.0 * eta[DISCREPANCY]
-            logs[self.rest_part] += self.error.rest_logs
-            slopes[DISCREPANCY, self.error_part.start : self.rest_part.stop] = 2.0
+            logs[self.error_part], slopes[DISCREPANCY, self.error_part] = 2.0 * eta[DISCREPANCY], 2.0
+            logs[self.rest_part] = self.error.rest_logs
         if self.shared is not None:
             spread, by_length = self.shared.spread(float(np.exp(eta[LENGTH])))
             logs[self.noise_part] = 2.0 * eta[SHARED] + spread

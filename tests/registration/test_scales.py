@@ -1,20 +1,39 @@
-"""Losses, scales found from data, and the reduction to what a cloud can tell."""
+"""Losses, scales found from data and their doubt, and the reduction to what a cloud can tell."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
-from softtwin.registration.hyperparameters import Hyperparameters, LogNormalPrior, estimate_hyperparameters, linearised
+from softtwin.registration.forward import reduce_model
+from softtwin.registration.gauss_newton import GaussNewton, LocalModel
+from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.loss import Huber, Loss, Square, Tukey, robust_deviation
-from softtwin.registration.posterior import Posterior, posterior
+from softtwin.registration.options import NOISE
+from softtwin.registration.policy import POLICY
+from softtwin.registration.pose import Pose
 from softtwin.registration.prepared import Prepared
-from softtwin.registration.priors import LikelihoodInformed, NodalForces, contact, localised, nodal_forces
+from softtwin.registration.priors import (
+    LikelihoodInformed,
+    ModelError,
+    NodalForces,
+    PosePrior,
+    contact,
+    localised,
+    nodal_forces,
+)
+from softtwin.registration.problem import Problem
 from softtwin.registration.residuals import SurfaceDistance
 
-from .conftest import Cantilever
+from .conftest import Cantilever, cloud_on, tip_forces
+from .test_model_error import patterns
 
+Floats = NDArray[np.float64]
 LOSSES = [Square(), Huber(), Tukey()]
 
 
@@ -50,36 +69,6 @@ def test_the_robust_deviation_forgets_outliers(rng) -> None:
     assert robust_deviation(x) == pytest.approx(1.0, rel=0.2)
 
 
-@pytest.mark.parametrize(("noise", "force"), [(1e-3, 0.1), (5e-3, 0.02), (1e-4, 1.0)])
-def test_scales_are_found_from_linear_data(rng, noise: float, force: float) -> None:
-    """30 coefficients tell their scale to 13 %, 400 points the noise to 4 %: three deviations of each, and the grid."""
-    jacobian = rng.standard_normal((400, 30))
-    coefficients = force * rng.standard_normal(30)
-    data = jacobian @ coefficients + noise * rng.standard_normal(400)
-    local = linearised(jacobian, -data, np.ones(400), np.zeros(30), 1.0)
-    found = estimate_hyperparameters(local, LogNormalPrior(1e-3, 2.0), LogNormalPrior(0.05, 2.5))
-    assert found.noise == pytest.approx(noise, rel=0.15)
-    assert found.force == pytest.approx(force, rel=0.45)
-    # About another state the linear problem is the same one.
-    away = rng.standard_normal(30)
-    again = linearised(jacobian, jacobian @ away - data, np.ones(400), away, 1.0)
-    assert estimate_hyperparameters(again, LogNormalPrior(1e-3, 2.0), LogNormalPrior(0.05, 2.5)).noise == pytest.approx(
-        found.noise, rel=1e-6
-    )
-
-
-def test_a_scale_that_is_known_stays(rng) -> None:
-    jacobian = rng.standard_normal((100, 5))
-    local = linearised(jacobian, rng.standard_normal(100), np.ones(100), np.zeros(5), 1.0)
-    assert estimate_hyperparameters(local, LogNormalPrior(1e-2, 0.0), LogNormalPrior(0.05, 1.0)).noise == pytest.approx(
-        1e-2, rel=0.06
-    )
-    assert (
-        estimate_hyperparameters(local, LogNormalPrior(1e-2, 1.0, minimum=5.0), LogNormalPrior(0.05, 1.0)).noise
-        >= 5.0 * 0.95
-    )
-
-
 def told_forces(forces: NodalForces, observed: SurfaceDistance, rule: LikelihoodInformed) -> NodalForces:
     return Prepared.of(Cantilever(observed.body), observed, forces).informed(observed, rule).forces
 
@@ -97,31 +86,89 @@ def test_what_is_left_out_keeps_its_variance(body: Body) -> None:
     assert three.size == 3
 
 
-def test_without_data_the_posterior_is_the_prior() -> None:
-    found = posterior(np.zeros((3, 3)), np.array([4.0, 4.0, 1.0]), np.zeros(3), _scales(), 2)
-    np.testing.assert_allclose(found.covariance, np.diag([0.25, 0.25, 1.0]))
-    assert found.informed == 0.0
+def problem(body: Body, rng: np.random.Generator, **given: Any) -> Problem:
+    """Of a cloud with a millimetre of noise, in which neighbours share none; what is given is otherwise."""
+    observed = SurfaceDistance(body, body.surfaces["observed"])
+    forces = given.pop("forces", nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 1.0)))
+    model = Cantilever(body)
+    truth = model.solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
+    known: dict[str, Any] = {
+        "model": reduce_model(model, observed.nodes, forces.basis),
+        "observed": observed,
+        "forces": forces,
+        "pose": None,
+        "cloud": cloud_on(body, truth, 300, rng, 1e-3),
+        "noise": LogNormalPrior(1e-3, 0.0),
+    }
+    return Problem(**{**known, **given})
 
 
-def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(rng) -> None:
-    """As far as the mean moves with the scale, by differences, beside the covariance at that scale."""
-    jacobian, data, spread = rng.standard_normal((20, 3)), rng.standard_normal(20), 0.3
-
-    def found(scale: float) -> Posterior:
-        precision = np.array([scale**-2, scale**-2, 1.0])
-        inverse = np.linalg.inv(jacobian.T @ jacobian + np.diag(precision))
-        scales = Hyperparameters(1.0, scale, (0.0, spread))
-        return posterior(jacobian.T @ jacobian, precision, inverse @ (jacobian.T @ data), scales, 2)
-
-    here, step = found(0.3), 1e-4
-    slope = (found(0.3 * np.exp(step)).mean - found(0.3 * np.exp(-step)).mean) / (2.0 * step)
-    alone = np.linalg.inv(jacobian.T @ jacobian + np.diag([0.3**-2, 0.3**-2, 1.0]))
-    np.testing.assert_allclose(here.covariance, alone + spread**2 * np.outer(slope, slope), rtol=1e-5)
+def settled(given: Problem) -> LocalModel:
+    """About the minimum of squares."""
+    return GaussNewton((Square(),), settled=1e-5, enough=1e-4).solve(given, np.zeros(given.size)).local
 
 
-def _scales():
-    local = linearised(np.eye(3), np.ones(3), np.ones(3), np.zeros(3), 1.0)
-    return estimate_hyperparameters(local, LogNormalPrior(1.0, 0.0), LogNormalPrior(0.5, 0.0))
+def test_a_scale_that_is_known_stays(body: Body, rng: np.random.Generator) -> None:
+    """A noise that is 3 or 50 times the cloud's own; one that is bounded from below; forces of a size that is told."""
+    for known in (3e-3, 5e-2):
+        assert settled(problem(body, rng, noise=LogNormalPrior(known, 0.0))).noise == pytest.approx(known)
+    assert settled(problem(body, rng, noise=LogNormalPrior(1e-3, 1.0))).noise == pytest.approx(1e-3, rel=0.2)
+    bounded = settled(problem(body, rng, noise=LogNormalPrior(1e-3, 1.0, minimum=5e-3)))
+    assert bounded.noise == pytest.approx(5e-3)
+    told = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.002, 0.0))
+    assert settled(problem(body, rng, forces=told)).scales.force == pytest.approx(0.002)
+
+
+def test_without_data_the_posterior_is_the_prior(body: Body, rng: np.random.Generator) -> None:
+    """All points are outliers: each block of unknowns keeps its own variance, each scale its median."""
+    observed = SurfaceDistance(body, body.surfaces["observed"])
+    error = ModelError.of(patterns(body), observed)
+    pose = PosePrior(Pose.identity(), body.points.mean(axis=0))
+    far = cloud_on(body, np.full_like(body.points, 5.0), 50, rng)
+    given = problem(body, rng, cloud=far, pose=pose, error=error, shared=observed.modes, noise=NOISE)
+    local = LocalModel(given, given.evaluation(np.zeros(given.size)), Tukey(), 1e-3)
+    assert not local.weights.any()
+    found, hyperprior = local.posterior(), given.hyperprior
+    np.testing.assert_allclose(local.eta, hyperprior.median, atol=0.05)
+    shared = POLICY.shared_size**2 * np.exp(observed.modes.spread(local.scales.length)[0])
+    variances = [np.full(given.forces.size, 0.05**2), np.ones(6 + 2), np.exp(error.rest_logs), shared]
+    np.testing.assert_allclose(np.diag(found.covariance), np.concatenate(variances), rtol=0.02)
+    off = found.covariance - np.diag(np.diag(found.covariance))
+    np.testing.assert_allclose(off, 0.0, atol=1e-12)
+    assert found.informed == pytest.approx(0.0, abs=1e-12)
+
+
+def dense_evidence(local: LocalModel, force: float) -> float:
+    """Minus the logarithm of the normal law of all points for a force scale, with its prior, but for a constant."""
+    data = local.jacobian @ local.evaluation.coefficients - local.problem.residuals(local.evaluation, local.noise)
+    covariance = local.noise**2 * np.eye(len(data)) + force**2 * local.jacobian @ local.jacobian.T
+    scale = local.problem.forces.scale
+    believed = (np.log(force / scale.median) / scale.spread) ** 2
+    return 0.5 * float(np.linalg.slogdet(covariance)[1] + data @ np.linalg.solve(covariance, data) + believed)
+
+
+def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(body: Body, rng: np.random.Generator) -> None:
+    """As far as the mean moves with the scale, by differences, beside the covariance at that scale.
+
+    The scale is the most likely one, its doubt the curvature there, of the normal law of all points.
+    """
+    local = settled(problem(body, rng))
+    force, step = local.scales.force, 0.02
+    ahead, here, behind = (dense_evidence(local, force * np.exp(sign * step)) for sign in (1.0, 0.0, -1.0))
+    curvature = (ahead - 2.0 * here + behind) / step**2
+    assert abs(ahead - behind) / (2.0 * step) < 0.05 * np.sqrt(curvature)
+
+    def mean(scale: float) -> Floats:
+        forces = replace(local.problem.forces, scale=LogNormalPrior(scale, 0.0))
+        held = LocalModel(replace(local.problem, forces=forces), local.evaluation, Square(), local.noise)
+        return held.evaluation.coefficients - held.solved(held.gradient[:, None])[:, 0]
+
+    slope = (mean(force * np.exp(1e-4)) - mean(force * np.exp(-1e-4))) / 2e-4
+    alone = np.linalg.inv(local.jacobian.T @ local.jacobian / local.noise**2 + np.eye(len(slope)) / force**2)
+    added = local.posterior().covariance - alone
+    wanted = np.outer(slope, slope) / curvature
+    np.testing.assert_allclose(added, wanted, atol=0.03 * np.abs(wanted).max())
+    assert np.trace(wanted) > 1e-3 * np.trace(alone)
 
 
 def test_smooth_forces_correlate_and_keep_their_scale(body: Body) -> None:
