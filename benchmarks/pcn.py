@@ -42,13 +42,15 @@ QUANTITIES = ("net force", "mean displacement")
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """What is known of the coefficients after a cloud, without normals, landmarks or a pose, at hyperparameters that are held.
+    """What is known of the coefficients after a cloud, at hyperparameters that are held.
+
+    The cloud has no normals, there are no landmarks, and the pose is known.
 
     Args:
         problem: what was registered.
         evaluation: where the solver ended.
         scale: standard deviation of each coefficient beforehand, (k,).
-        noise: found, metres.
+        noise: of a point's own that was found, metres: by it distances to round places are expected to be off.
         deviations: of the points, (p,), metres.
         loss: of each.
     """
@@ -66,7 +68,7 @@ class Law:
         local = found.local
         assert local is not None  # it was registered
         scale = 1.0 / np.sqrt(local.precision)
-        return cls(found.problem, found.evaluation, scale, local.noise, local.deviations, loss or Tukey())
+        return cls(found.problem, found.evaluation, scale, local.own, local.deviations, loss or Tukey())
 
     def log_likelihood(self, whitened: Floats) -> float:
         """Of coefficients over their scales beforehand, (k,), up to a constant."""

@@ -27,9 +27,10 @@ from .hyperparameters import LogNormalPrior
 Floats = NDArray[np.float64]
 # Logarithms of variances as functions of the logarithms eta of the hyperparameters, with their derivatives.
 Variances = Callable[[Floats], tuple[Floats, Floats]]
-_DESCENT = {"maxiter": 20, "gtol": 1e-2, "ftol": 1e-7, "maxls": 10}  # of the logarithm of the evidence
+_DESCENT = {"maxiter": 20, "ftol": 1e-8, "maxls": 10}
+_SETTLED = 2e-2  # of the logarithm of the evidence, by a logarithm of a scale
 _STEP = 0.02  # of a logarithm, for a difference
-_REACH = 20.0  # spreads: nobody believes in more, and beyond it exponentials overflow
+_REACH = 14.0  # of a logarithm about the median: a factor of a million, beyond which sums lose their digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,7 @@ class Hyperprior:
         with np.errstate(divide="ignore"):
             median, lowest, highest = np.log(np.array(rows)).T
         spread = np.array([each.spread for each in priors])
-        reach = np.where(spread > 0.0, _REACH * spread, np.inf)
+        reach = np.where(spread > 0.0, _REACH, np.inf)
         return cls(median, spread, np.maximum(lowest, median - reach), np.minimum(highest, median + reach))
 
     def with_minimum(self, place: int, value: float) -> Hyperprior:
@@ -156,6 +157,15 @@ class Evidence:
         data = data + problem.information.reshape(len(noise), -1) @ second.ravel()
         return value, gradient + 0.5 * by_noise @ (problem.count - precision * data)
 
+    def mean(self, eta: Floats) -> Floats:
+        """The unknowns' posterior mean at logarithms of the hyperparameters, (k,)."""
+        root = np.exp(0.5 * self.prior(eta)[0])
+        matrix, pull = self.problem.weighted(np.exp(-self.noise(eta)[0]))
+        matrix = matrix * root[:, None] * root
+        matrix[np.diag_indices(len(root))] += 1.0 + np.finfo(float).eps * np.trace(matrix)
+        found: Floats = root * np.linalg.solve(matrix, root * pull)
+        return found
+
     def maximum(self, starts: Sequence[Floats]) -> Floats:
         """The most likely logarithms of the hyperparameters, (h,): the best of the descents from several starts.
 
@@ -167,15 +177,18 @@ class Evidence:
         if not sought.any():
             return best
         bounds = np.column_stack([hyperprior.lowest, hyperprior.highest])[sought]
+        # For each point: the first step of a bounded descent is as long as the gradient, and would end at a bound.
+        share = 1.0 / max(float(self.problem.count.sum()), 1.0)
+        options = {**_DESCENT, "gtol": share * _SETTLED}
         for start in starts:
             eta = hyperprior.within(start)
 
             def cost(part: Floats, eta: Floats = eta) -> tuple[float, Floats]:
                 eta[sought] = part
                 value, gradient = self.value(eta)
-                return value, gradient[sought]
+                return share * value, share * gradient[sought]
 
-            found = minimize(cost, eta[sought], jac=True, method="L-BFGS-B", bounds=bounds, options=_DESCENT)
+            found = minimize(cost, eta[sought], jac=True, method="L-BFGS-B", bounds=bounds, options=options)
             if found.fun < lowest:
                 lowest = float(found.fun)
                 best = eta.copy()

@@ -16,7 +16,7 @@ from softtwin.reference.data.outcome import NotConverged
 
 from . import landmarks
 from .evidence import Evidence, LinearProblem
-from .hyperparameters import DISCREPANCY, LENGTH, NOISE, SHARED, Hyperparameters
+from .hyperparameters import LENGTH, NOISE, SHARED, Hyperparameters
 from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .posterior import Posterior
@@ -200,6 +200,7 @@ class _Search:
         self.evaluation = _begun(self.problem, start, near)
         self.evaluations, self.limit = 1, self._first_limit
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
+        self.own = 0.0
         self.eta: Floats | None = eta
         self.trace: list[IterationRecord] = []
         self._at: LocalModel | None = None
@@ -231,8 +232,10 @@ class _Search:
         if at is None or at.evaluation is not self.evaluation or at.loss is not loss:
             jacobian = None if at is None or at.evaluation is not self.evaluation else at.jacobian
             starts = self._starts() if at is None or at.loss is not loss else [at.eta]
-            at = LocalModel(self.problem, self.evaluation, loss, self.noise, self.options.graduation, jacobian, starts)
-            self._at, self.noise, self.eta = at, at.noise, at.eta
+            at = LocalModel(
+                self.problem, self.evaluation, loss, self.noise, self.options.graduation, jacobian, starts, self.own
+            )
+            self._at, self.noise, self.own, self.eta = at, at.noise, at.own, at.eta
         return at
 
     def _starts(self) -> list[Floats]:
@@ -344,6 +347,7 @@ class LocalModel:
         graduation: the noise is taken as at least this part of what the linear model promises to change.
         jacobian: of the distances at the trial, (p, k), where it is known.
         starts: logarithms of hyperparameters that the search for them begins with; those that are believed if none.
+        own: the points' own noise so far, metres, without what is yet to be explained; None for all of it.
     """
 
     def __init__(
@@ -355,9 +359,10 @@ class LocalModel:
         graduation: float = 0.0,
         jacobian: Floats | None = None,
         starts: Sequence[Floats] = (),
+        own: float | None = None,
     ) -> None:
         self.problem, self.evaluation, self.loss = problem, evaluation, loss
-        self.was_whole = True
+        self.was_whole, self.own = True, noise if own is None else own
         self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
         off, leaning = problem.landmark_residuals(evaluation), problem.normal_residuals(evaluation)
         self.landmark_information, by_landmarks = _told(
@@ -365,12 +370,12 @@ class LocalModel:
         )
         self.normal_information, by_normals = _told(leaning, loss, lambda: problem.normal_jacobian(evaluation))
         self._beside = by_landmarks + by_normals
-        self.left_out = problem.rough(evaluation)
+        self.rough = problem.rough(evaluation)
         self.eta, self.is_graduated = self._found(noise, graduation, list(starts))
         self.scales = Hyperparameters(*np.exp(self.eta))
         self.noise = self.scales.noise
-        self.deviations = np.hypot(self.noise, self.left_out)
-        residuals = problem.residuals(evaluation, self.noise)
+        self.deviations = np.hypot(self.noise, self.rough)
+        residuals = problem.residuals(evaluation, self.own)
         self.weights = loss.weight(residuals / self.deviations)
         self.precision = np.exp(-problem.prior_variances(self.eta)[0])
         self.information = self._products(self.weights / self.deviations**2)
@@ -387,35 +392,45 @@ class LocalModel:
         found: Floats = trusted.T @ trusted
         return found
 
-    def _evidence(self, noise: float, rough: float) -> Evidence:
-        """Of the hyperparameters, with the weights that the points have at some noise, metres, and model error."""
+    def _evidence(self, noise: float, eta: Floats) -> Evidence:
+        """Of the hyperparameters, with the weights that the points have at some noise, metres.
+
+        Weights cut tails off: what a normal law has there is added to the squares of what the linear model leaves.
+
+        Args:
+            noise: standard deviation of a point's distance, metres.
+            eta: logarithms of hyperparameters near those sought, (5,).
+        """
         problem, coefficients = self.problem, self.evaluation.coefficients
-        residuals = problem.residuals(self.evaluation, noise)
-        weights = self.loss.weight(residuals / np.hypot(noise, self.left_out))
+        residuals = problem.residuals(self.evaluation, self.own)
+        weights = self.loss.weight(residuals / np.hypot(noise, self.rough))
         data = self.jacobian @ coefficients - residuals
         known = self.landmark_information + self.normal_information
-        groups = _groups(self.left_out)
+        groups = _groups(self.rough)
         trusted = np.sqrt(weights)[:, None] * self.jacobian
-        beyond = 1.0 / self.loss.consistency - 1.0
         linear = LinearProblem(
             np.stack([trusted[group].T @ trusted[group] for group in groups]),
             np.stack([(weights[group] * data[group]) @ self.jacobian[group] for group in groups]),
             np.array([data[group] @ (weights[group] * data[group]) for group in groups]),
             np.array([weights[group].sum() for group in groups]),
-            np.array([beyond * (residuals[group] @ (weights[group] * residuals[group])) for group in groups]),
+            np.zeros(len(groups)),
             None if isinstance(known, float) else (known, known @ coefficients - self._beside),
         )
-        there = np.sqrt([np.mean(self.left_out[group] ** 2) for group in groups])
-        return Evidence(linear, problem.noise_variances(there), problem.prior_variances, problem.hyperprior)
+        there = np.sqrt([np.mean(self.rough[group] ** 2) for group in groups])
+        found = Evidence(linear, problem.noise_variances(there), problem.prior_variances, problem.hyperprior)
+        left = weights * (data - self.jacobian @ found.mean(eta)) ** 2
+        beyond = 1.0 / self.loss.consistency - 1.0
+        return replace(found, problem=replace(linear, tail=np.array([beyond * left[group].sum() for group in groups])))
 
     def _found(self, noise: float, graduation: float, starts: list[Floats]) -> tuple[Floats, bool]:
         """Logarithms of the hyperparameters, and whether the noise is held above what the model would believe."""
-        evidence = self._evidence(noise, float(np.exp(starts[0][DISCREPANCY])) if starts else 1.0)
         if not starts:
-            start = evidence.hyperprior.median.copy()
+            start = self.problem.hyperprior.median.copy()
             start[NOISE] = np.log(noise)
             starts = [start]
+        evidence = self._evidence(noise, self.problem.hyperprior.within(starts[0]))
         eta = evidence.maximum(starts)
+        self.own = float(np.exp(eta[NOISE]))
         minimum = np.log(max(graduation * self._promised(evidence, eta), 1e-300))
         if minimum <= eta[NOISE]:
             return eta, False
@@ -424,10 +439,7 @@ class LocalModel:
 
     def _promised(self, evidence: Evidence, eta: Floats) -> float:
         """Root mean square change of the residuals by the best step at some hyperparameters, metres."""
-        linear, root = evidence.problem, np.exp(0.5 * self.problem.prior_variances(eta)[0])
-        matrix, pull = linear.weighted(np.exp(-evidence.noise(eta)[0]))
-        matrix = root[:, None] * matrix * root + np.eye(len(root))
-        step = root * np.linalg.solve(matrix, root * pull) - self.evaluation.coefficients
+        linear, step = evidence.problem, evidence.mean(eta) - self.evaluation.coefficients
         square = float(np.einsum("gij,i,j->", linear.information, step, step, optimize=True))
         return float(np.sqrt(max(square, 0.0) / max(linear.count.sum(), 1.0)))
 
@@ -471,7 +483,7 @@ class LocalModel:
     def objective(self, evaluation: Evaluation, loss: Loss) -> float:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ evaluation.coefficients**2)
-        scaled = self.problem.residuals(evaluation, self.noise) / self.deviations
+        scaled = self.problem.residuals(evaluation, self.own) / self.deviations
         off = self.problem.landmark_residuals(evaluation)
         leaning = self.problem.normal_residuals(evaluation, self.evaluation.match)
         beside = float(landmarks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
@@ -484,7 +496,7 @@ class LocalModel:
 
     def length_for(self, evaluation: Evaluation) -> float:
         """The same at a trial of the same coefficients with other closest points, with these derivatives."""
-        residuals = self.problem.residuals(evaluation, self.noise)
+        residuals = self.problem.residuals(evaluation, self.own)
         gradient = self._gradient(residuals, self.loss.weight(residuals / self.deviations))
         return _length(self._whole_for(gradient), gradient)
 
@@ -524,12 +536,13 @@ class LocalModel:
 
     def _by_hyperparameters(self, covariance: Floats) -> tuple[Floats, Floats]:
         """Derivative of the mean by the logarithms of the hyperparameters, (k, h), and their covariance, (h, h)."""
-        evidence = self._evidence(self.noise, self.scales.discrepancy)
+        evidence = self._evidence(self.noise, self.eta)
         _, slopes = self.problem.prior_variances(self.eta)
         held = self.precision * self.evaluation.coefficients
         columns = (slopes * held).T
-        pull = -2.0 * (held + self._beside)
-        columns[:, NOISE] = pull
+        residuals = self.problem.residuals(self.evaluation, self.own)
+        share = (self.noise / self.deviations) ** 2  # of a distance's variance that is its own noise
+        columns[:, NOISE] = 2.0 * (share * self.weights * residuals / self.deviations**2) @ self.jacobian
         return covariance @ columns, evidence.covariance(self.eta)
 
 

@@ -162,7 +162,7 @@ class _Run:
 
 def _objective(problem: Problem, evaluation: Evaluation, loss: Loss, local: LocalModel) -> tuple[float, Floats]:
     """Robust distances and their gradient by the coefficients, (k,), at the scales of a model."""
-    scaled = problem.residuals(evaluation, local.noise) / local.deviations
+    scaled = problem.residuals(evaluation, local.own) / local.deviations
     slope = loss.weight(scaled) * scaled / local.deviations
     value, gradient = float(loss.value(scaled).sum()), problem.vjp(evaluation, slope)
     off, held = problem.landmark_residuals(evaluation), local.evaluation.match

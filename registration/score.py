@@ -50,7 +50,7 @@ def score(local: LocalModel, columns: Floats) -> Score | None:
     solved = local.solved(across)
     information = columns.T @ weighted - across.T @ solved
     # What the last step, which was not taken, would still change of the residuals counts, too.
-    pull = solved.T @ local.gradient - weighted.T @ local.problem.residuals(local.evaluation, local.noise)
+    pull = solved.T @ local.gradient - weighted.T @ local.problem.residuals(local.evaluation, local.own)
     values, vectors = np.linalg.eigh(information)
     scale = np.diag(columns.T @ weighted).max(initial=0.0)
     if not len(values) or not values[0] > np.finfo(float).eps * len(weights) * scale:

@@ -47,7 +47,9 @@ def test_the_solver_has_ended_where_the_density_is_largest(law: Law, rng: np.ran
         drawn = rng.standard_normal(int(told.sum()))
         step = vectors[:, told] @ (np.sqrt(variances[told]) * drawn)
         fall = at_mode - np.mean([density(law.mode + sign * step) for sign in (1.0, -1.0)])
-        assert fall == pytest.approx(0.5 * float(drawn @ drawn), rel=0.5)  # its curvature is Laplace's, up to points between losses
+        assert fall == pytest.approx(
+            0.5 * float(drawn @ drawn), rel=0.5
+        )  # its curvature is Laplace's, up to points between losses
 
 
 def test_the_quantities_move_as_their_slopes_say(law: Law, rng: np.random.Generator) -> None:

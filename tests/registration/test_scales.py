@@ -88,7 +88,7 @@ def test_what_is_left_out_keeps_its_variance(body: Body) -> None:
 
 def problem(body: Body, rng: np.random.Generator, **given: Any) -> Problem:
     """Of a cloud with a millimetre of noise, in which neighbours share none; what is given is otherwise."""
-    observed = SurfaceDistance(body, body.surfaces["observed"])
+    observed = given.pop("observed", SurfaceDistance(body, body.surfaces["observed"]))
     forces = given.pop("forces", nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 1.0)))
     model = Cantilever(body)
     truth = model.solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
@@ -140,7 +140,7 @@ def test_without_data_the_posterior_is_the_prior(body: Body, rng: np.random.Gene
 
 def dense_evidence(local: LocalModel, force: float) -> float:
     """Minus the logarithm of the normal law of all points for a force scale, with its prior, but for a constant."""
-    data = local.jacobian @ local.evaluation.coefficients - local.problem.residuals(local.evaluation, local.noise)
+    data = local.jacobian @ local.evaluation.coefficients - local.problem.residuals(local.evaluation, local.own)
     covariance = local.noise**2 * np.eye(len(data)) + force**2 * local.jacobian @ local.jacobian.T
     scale = local.problem.forces.scale
     believed = (np.log(force / scale.median) / scale.spread) ** 2
@@ -150,9 +150,15 @@ def dense_evidence(local: LocalModel, force: float) -> float:
 def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(body: Body, rng: np.random.Generator) -> None:
     """As far as the mean moves with the scale, by differences, beside the covariance at that scale.
 
-    The scale is the most likely one, its doubt the curvature there, of the normal law of all points.
+    The scale is the most likely one, its doubt the curvature there, of the normal law of all points. These are few and
+    said to be bad, so that what is found depends on the scale; planes let the descent end at the minimum itself.
     """
-    local = settled(problem(body, rng))
+    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
+    cloud, planes = cloud_on(body, truth, 60, rng, 1e-3), SurfaceDistance(body, body.surfaces["observed"], "plane")
+    every = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 1.0))
+    across = np.kron(np.full((len(every.nodes), 1), len(every.nodes) ** -0.5), np.eye(3)[:, 1:])  # all nodes together
+    forces, noise = every.combined(across), LogNormalPrior(0.05, 0.0)
+    local = settled(problem(body, rng, forces=forces, cloud=cloud, observed=planes, noise=noise))
     force, step = local.scales.force, 0.02
     ahead, here, behind = (dense_evidence(local, force * np.exp(sign * step)) for sign in (1.0, 0.0, -1.0))
     curvature = (ahead - 2.0 * here + behind) / step**2
@@ -160,7 +166,8 @@ def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(body: Body, rng: np.ra
 
     def mean(scale: float) -> Floats:
         forces = replace(local.problem.forces, scale=LogNormalPrior(scale, 0.0))
-        held = LocalModel(replace(local.problem, forces=forces), local.evaluation, Square(), local.noise)
+        known = replace(local.problem, forces=forces)
+        held = LocalModel(known, local.evaluation, Square(), local.noise, own=local.own)
         return held.evaluation.coefficients - held.solved(held.gradient[:, None])[:, 0]
 
     slope = (mean(force * np.exp(1e-4)) - mean(force * np.exp(-1e-4))) / 2e-4
@@ -168,7 +175,7 @@ def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(body: Body, rng: np.ra
     added = local.posterior().covariance - alone
     wanted = np.outer(slope, slope) / curvature
     np.testing.assert_allclose(added, wanted, atol=0.03 * np.abs(wanted).max())
-    assert np.trace(wanted) > 1e-3 * np.trace(alone)
+    assert np.trace(wanted) > 0.1 * np.trace(alone)
 
 
 def test_smooth_forces_correlate_and_keep_their_scale(body: Body) -> None:

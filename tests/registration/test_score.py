@@ -44,7 +44,7 @@ def test_of_a_right_model_chances_are_no_smaller_than_they_say(registrar: Regist
         found = registrar.register(some_cloud(registrar, seed))
         doubted += found.judgement.verdict is not Verdict.ACCEPTED
         for name, columns in (("scale", by_scale), ("motion", by_rigid_motion)):
-            told = score(found.local, columns(found.local), found.inflation_factor)
+            told = score(found.local, columns(found.local))
             assert told is not None
             tested[name].append(told.p_value)
     assert doubted <= 3
