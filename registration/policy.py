@@ -53,7 +53,7 @@ class Policy:
         128, "", "modes of the observed side in which it is described", "fields of 18 mm on the liver's visible side"
     )
     discrepancy_spread: float = choice(
-        0.5,
+        0.25,
         "",
         "standard deviation of the logarithm of what the model gets wrong over what it was seen to",
         "robustness, surrogate: noise 1 mm; with 0.5 its error is 8 % larger",
