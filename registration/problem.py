@@ -130,7 +130,7 @@ class Problem:
     def noise_part(self) -> slice:
         """Where those of the noise that neighbours share are."""
         begin = self.rest_part.stop
-        return slice(begin, begin + (0 if self.shared is None else len(self.shared.values)))
+        return slice(begin, begin + (0 if self.shared is None else 3 * len(self.shared.values)))
 
     @cached_property
     def unshared(self) -> Problem:
@@ -146,8 +146,10 @@ class Problem:
         """The part of the distances that is taken for noise that neighbours share, (p,), metres."""
         if self.shared is None:
             return np.zeros(len(self.cloud))
-        field = self.shared.modes @ evaluation.coefficients[self.noise_part]
-        return self.observed.at_vertices(evaluation.match, field)
+        field = self.shared.modes @ evaluation.coefficients[self.noise_part].reshape(3, -1).T
+        shifts = self.observed.vectors_at(evaluation.match, field)
+        found: Floats = np.einsum("pi,pi->p", shifts, evaluation.match.directions)
+        return found
 
     def left_out(self, evaluation: Evaluation) -> Floats:
         """The part of the distances that is taken for what patterns of the model's error leave out, (p,), metres."""
@@ -174,7 +176,8 @@ class Problem:
             there = self.observed.at_points(match, self.error.across)
             columns.append(-there[:, None] * self.error.rest_modes.at(corners, match.weights))
         if self.shared is not None:
-            columns.append(-self.shared.at(corners, match.weights))
+            modes = self.shared.at(corners, match.weights)
+            columns += [-along[:, None] * modes for along in match.directions.T]
         return np.hstack(columns)
 
     def carried(self, coefficients: Floats, before: Problem) -> Floats:
@@ -237,8 +240,8 @@ class Problem:
             logs[self.rest_part] = self.error.rest_logs
         if self.shared is not None:
             spread, by_length = self.shared.spread(float(np.exp(eta[LENGTH])))
-            logs[self.noise_part] = 2.0 * eta[SHARED] + spread
-            slopes[SHARED, self.noise_part], slopes[LENGTH, self.noise_part] = 2.0, by_length
+            logs[self.noise_part] = 2.0 * eta[SHARED] + np.tile(spread, 3)
+            slopes[SHARED, self.noise_part], slopes[LENGTH, self.noise_part] = 2.0, np.tile(by_length, 3)
         return logs, slopes
 
     def evaluation(self, coefficients: Floats, near: Evaluation | None = None, *, anew: bool = False) -> Evaluation:

@@ -86,6 +86,11 @@ class SurfaceDistance:
         found: Floats = np.einsum("pk,pk->p", match.weights, field[self.triangles[match.triangles]])
         return found
 
+    def vectors_at(self, match: Correspondence, field: Floats) -> Floats:
+        """A vector of each vertex of the observed side, (v, 3), at the closest points of a match, (p, 3)."""
+        found: Floats = np.einsum("pk,pki->pi", match.weights, field[self.triangles[match.triangles]])
+        return found
+
     @cached_property
     def modes(self) -> SurfaceModes:
         """The smoothest functions on the observed side at rest."""
