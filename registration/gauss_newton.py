@@ -24,6 +24,7 @@ from .problem import Evaluation, Problem
 
 Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
+_UNSHARED = 8  # iterations in which points far off are told, before noise that neighbours share is thought of
 _KEPT = 0.2  # a whole step that misses its promise by less: where only a start is wanted, it was the last
 _TRUSTED = 3.0  # deviations
 _NEARER = 1e-3  # part of the objective that closest points searched anew must take away to go on
@@ -200,7 +201,7 @@ class _Search:
         self.evaluation = _begun(self.problem, start, near)
         self.evaluations, self.limit = 1, self._first_limit
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
-        self.own = 0.0
+        self.own, self.begun = 0.0, 0
         self.eta: Floats | None = eta
         self.trace: list[IterationRecord] = []
         self._at: LocalModel | None = None
@@ -213,7 +214,8 @@ class _Search:
         options = self.options
         ended = [self._descend(loss, options.handed_on) for loss in options.losses[:-1]]
         if self.problem is not self.whole:  # first what points far off are told by, then what neighbours share
-            ended.append(self._descend(options.losses[-1], options.settled))
+            ended.append(self._descend(options.losses[-1], options.settled, _UNSHARED))
+            self.begun = len(self.trace)
             self.problem, self._at = self.whole, None
             grown = np.zeros(self.whole.size)
             grown[: len(self.evaluation.coefficients)] = self.evaluation.coefficients
@@ -252,9 +254,10 @@ class _Search:
         without[SHARED] = self.problem.hyperprior.median[SHARED]
         return [without, with_it]
 
-    def _descend(self, loss: Loss, settled: float) -> Outcome:
+    def _descend(self, loss: Loss, settled: float, most: int = 0) -> Outcome:
+        most = len(self.trace) + most if most else self.begun + self.options.max_iterations
         is_handed_on, is_exact = settled >= self.options.handed_on, False
-        while len(self.trace) < self.options.max_iterations:
+        while len(self.trace) < most:
             local = self._local(loss)
             if local.length < settled and not local.is_graduated:
                 if is_handed_on or is_exact:
