@@ -39,15 +39,15 @@ class LinearProblem:
 
     Args:
         information: B' W B of each group, (g, k, k).
-        pull: B' W y, (g, k).
+        projection: B' W y, (g, k).
         square: y' W y, (g,).
         count: sums of the weights, (g,).
         tail: what is added to the squares for the tails that robust weights have cut off, (g,).
-        known: the same as `information`, `pull` of residuals whose deviation is known, over its square.
+        known: the same as `information`, `projection` of residuals whose deviation is known, over its square.
     """
 
     information: Floats
-    pull: Floats
+    projection: Floats
     square: Floats
     count: Floats
     tail: Floats
@@ -59,9 +59,9 @@ class LinearProblem:
         Args:
             precision: of each group, (g,).
         """
-        count = self.pull.shape[1]
+        count = self.projection.shape[1]
         matrix = (precision @ self.information.reshape(len(precision), -1)).reshape(count, count)
-        pull = precision @ self.pull
+        pull = precision @ self.projection
         if self.known is not None:
             matrix, pull = matrix + self.known[0], pull + self.known[1]
         return matrix, pull
@@ -153,7 +153,7 @@ class Evidence:
         # y' W y - 2 m' B' W y + tr(B' W B (m m' + S)) of each group, over its variance
         moved = root * mean
         second = inverse * root[:, None] * root + moved[:, None] * moved
-        data = problem.square + problem.tail - 2.0 * problem.pull @ moved
+        data = problem.square + problem.tail - 2.0 * problem.projection @ moved
         data = data + problem.information.reshape(len(noise), -1) @ second.ravel()
         return value, gradient + 0.5 * by_noise @ (problem.count - precision * data)
 

@@ -233,26 +233,12 @@ class _Search:
         at = self._at
         if at is None or at.evaluation is not self.evaluation or at.loss is not loss:
             jacobian = None if at is None or at.evaluation is not self.evaluation else at.jacobian
-            starts = self._starts() if at is None or at.loss is not loss else [at.eta]
+            starts = starts_of(self.problem, self.noise, self.eta) if at is None or at.loss is not loss else [at.eta]
             at = LocalModel(
                 self.problem, self.evaluation, loss, self.noise, self.options.graduation, jacobian, starts, self.own
             )
             self._at, self.noise, self.own, self.eta = at, at.noise, at.own, at.eta
         return at
-
-    def _starts(self) -> list[Floats]:
-        """From where hyperparameters are sought when nothing near is known: without and with noise that is shared."""
-        believed = self.problem.hyperprior.median.copy()
-        if self.eta is not None:
-            believed = self.eta.copy()
-        believed[NOISE] = np.log(self.noise)
-        if self.problem.shared is None:
-            return [believed]
-        with_it = believed.copy()
-        with_it[SHARED], with_it[LENGTH] = np.log(self.noise), self.problem.hyperprior.median[LENGTH]
-        without = believed.copy()
-        without[SHARED] = self.problem.hyperprior.median[SHARED]
-        return [without, with_it]
 
     def _descend(self, loss: Loss, settled: float, most: int = 0) -> Outcome:
         most = len(self.trace) + most if most else self.begun + self.options.max_iterations
@@ -322,6 +308,24 @@ class _Search:
                 return None
         self.limit = self._first_limit
         return Outcome.REFUSED if unsolved else Outcome.NO_DESCENT
+
+
+def starts_of(problem: Problem, noise: float, eta: Floats | None = None) -> list[Floats]:
+    """From where hyperparameters are sought when nothing near is known: without and with noise that is shared.
+
+    Args:
+        problem: what is registered.
+        noise: standard deviation of a point's distance so far, metres.
+        eta: logarithms of the hyperparameters of a frame before; what is believed of them if not given.
+    """
+    without = problem.hyperprior.median.copy() if eta is None else eta.copy()
+    without[NOISE] = np.log(noise)
+    if problem.shared is None:
+        return [without]
+    median, with_it = problem.hyperprior.median, without.copy()
+    without[SHARED] = median[SHARED]
+    with_it[SHARED], with_it[LENGTH] = np.log(noise), median[LENGTH]
+    return [without, with_it]
 
 
 def _begun(problem: Problem, start: Floats, near: Evaluation | None) -> Evaluation:

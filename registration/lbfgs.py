@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from softtwin.reference.data.outcome import NotConverged
 
 from . import landmarks
-from .gauss_newton import IterationRecord, LocalModel, SolverResult
+from .gauss_newton import IterationRecord, LocalModel, SolverResult, starts_of
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .penalties import Penalty
@@ -104,10 +104,12 @@ class _Run:
         noise = max(robust_deviation(self.evaluation.match.distances), self.problem.noise.minimum)
         outcome = Outcome.CONVERGED
         for loss in self.options.losses:
-            local = LocalModel(self.problem, self.evaluation, loss, noise)
+            local = LocalModel(self.problem, self.evaluation, loss, noise, starts=starts_of(self.problem, noise))
             noise = local.noise
             outcome = self._descend(loss, local)
-        local = LocalModel(self.problem, self.evaluation, self.options.losses[-1], noise)
+        local = LocalModel(
+            self.problem, self.evaluation, self.options.losses[-1], noise, starts=starts_of(self.problem, noise)
+        )
         return SolverResult.at(local, outcome, self.evaluations, tuple(self.trace))
 
     def _descend(self, loss: Loss, local: LocalModel) -> Outcome:

@@ -74,7 +74,7 @@ class RegistrationOptions:
         hyperprior: when the size of the forces is left to the cloud.
         distance: of points to the surface, or to the planes of its triangles; see `SurfaceDistance`.
         normal_deviation: standard deviation of a measured normal across itself, radians.
-        correlated: look for noise that neighbouring points share; see `correlated.find_correlated`.
+        correlated: reckon with noise that neighbouring points share; see `surface_modes`.
     """
 
     noise: LogNormalPrior = NOISE

@@ -356,7 +356,7 @@ class ModelError:
         return self.size * self.left_out
 
     @cached_property
-    def across(self) -> Floats:
+    def distance_deviation(self) -> Floats:
         """The same of a distance to the surface, where all three components of it lie across that, (p,), metres."""
         found: Floats = np.sqrt(POLICY.discrepancy_along_normal) * self.rest
         return found

@@ -156,7 +156,7 @@ class Problem:
         if self.error is None:
             return np.zeros(len(self.cloud))
         field = self.error.rest_modes.modes @ evaluation.coefficients[self.rest_part]
-        there = self.observed.at_points(evaluation.match, self.error.across)
+        there = self.observed.at_points(evaluation.match, self.error.distance_deviation)
         return there * self.observed.at_vertices(evaluation.match, field)
 
     def rough(self, evaluation: Evaluation) -> Floats:
@@ -166,14 +166,14 @@ class Problem:
         """
         if self.error is None:
             return np.zeros(len(self.cloud))
-        return self.observed.at_points(evaluation.match, self.error.across)
+        return self.observed.at_points(evaluation.match, self.error.distance_deviation)
 
     def _by_distances(self, evaluation: Evaluation) -> Floats:
         """Derivative of the residuals by the coefficients that change the distances alone, (p, q)."""
         match, columns = evaluation.match, [np.zeros((len(self.cloud), 0))]
         corners = self.observed.triangles[match.triangles]
         if self.error is not None:
-            there = self.observed.at_points(match, self.error.across)
+            there = self.observed.at_points(match, self.error.distance_deviation)
             columns.append(-there[:, None] * self.error.rest_modes.at(corners, match.weights))
         if self.shared is not None:
             modes = self.shared.at(corners, match.weights)
@@ -203,16 +203,16 @@ class Problem:
         scale = self.forces.scale
         priors = [self.noise, scale if self.forces.size else replace(scale, spread=0.0), never, never, never]
         if self.shared is not None:
-            least = POLICY.shared_length_least * self.observed.edge
+            least = POLICY.shared_length_minimum * self.observed.edge
             median = max(POLICY.shared_length * np.sqrt(self.shared.area), least)
-            longest = POLICY.shared_length_most * median
+            longest = POLICY.shared_length_maximum * median
             priors[SHARED] = LogNormalPrior(
-                POLICY.shared_size, POLICY.shared_size_spread, maximum=POLICY.shared_size_most
+                POLICY.shared_size, POLICY.shared_size_spread, maximum=POLICY.shared_size_maximum
             )
             priors[LENGTH] = LogNormalPrior(median, POLICY.shared_length_spread, least, longest)
         if self.error is not None:
             priors[DISCREPANCY] = LogNormalPrior(
-                1.0, POLICY.discrepancy_spread, POLICY.discrepancy_least, POLICY.discrepancy_most
+                1.0, POLICY.discrepancy_spread, POLICY.discrepancy_minimum, POLICY.discrepancy_maximum
             )
         return Hyperprior.of(priors)
 

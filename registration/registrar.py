@@ -317,7 +317,7 @@ class Registrar:
             parameter_blocks=self.parameter_blocks,
             landmarks=self.landmarks,
             normal_deviation=self.options.normal_deviation,
-            shared=self.observed.modes.leading(48) if self.options.correlated else None,
+            shared=self.observed.modes if self.options.correlated else None,
         )
 
     def _problem(self, points: Cloud, prepared: Prepared, near: SolverResult | Registration) -> Problem:

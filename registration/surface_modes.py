@@ -1,9 +1,9 @@
 """Smooth fields over a surface: eigenmodes of its Laplacian, and how a Gaussian process spreads over them.
 
-What neighbouring points err alike is a field over the side that is seen, of Matérn's covariance. In the eigenmodes of
-the Laplacian its coefficients are independent, and only their variances, the spectral density at the eigenvalues,
-depend on its size and length (Solin and Särkkä 2020; on surfaces Borovitskiy et al. 2020): both can be sought without
-looking at the points again.
+What neighbouring points err alike is a field over the side that is seen, of Matérn's covariance; a vector field, whose
+component along the normal the distances see. In the eigenmodes of the Laplacian its coefficients are independent, and
+only their variances, the spectral density at the eigenvalues, depend on its size and length (Solin and Särkkä 2020; on
+surfaces Borovitskiy et al. 2020): both can be sought without looking at the points again.
 """
 
 from __future__ import annotations

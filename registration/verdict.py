@@ -40,7 +40,6 @@ class Code(Enum):
     NORMALS = "normals"
     FORCES_ELSEWHERE = "forces_elsewhere"
     CONTACT = "contact"
-    CORRELATED_NOISE = "correlated_noise"
 
 
 @dataclass(frozen=True)

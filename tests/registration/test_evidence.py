@@ -126,10 +126,11 @@ def test_tails_that_weights_have_cut_off_count_as_noise(rng: np.random.Generator
     drawn = Drawn(rng, np.log([0.3, 2.0, 0.2]))
     evidence = drawn.evidence
     plain = evidence.maximum([np.log([1.0, 1.0, 0.1])])
-    squares = np.exp(2.0 * plain[0]) * evidence.problem.count
+    squares = np.exp(noise_variances(plain)[0]) * evidence.problem.count
     with_tail = replace(evidence, problem=replace(evidence.problem, tail=0.21 * squares))
     grown = with_tail.maximum([plain])
-    assert np.exp(grown[0] - plain[0]) == pytest.approx(1.1, abs=0.02)
+    squared = np.exp(noise_variances(grown)[0] - noise_variances(plain)[0])
+    assert squared == pytest.approx([1.21, 1.21], abs=0.05)
 
 
 def test_unknowns_of_no_size_are_none(rng: np.random.Generator) -> None:
