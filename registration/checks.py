@@ -72,7 +72,7 @@ class Expectations:
     informed: float = 2.0
     pose: float = 3.0
     parameter: float = 3.0
-    discrepancy_scale: float = 2.0
+    discrepancy_scale: float = 1.5
     correction: float = 0.0
     minimum_variance_reduction: float = 0.5
     gradient: float = np.inf

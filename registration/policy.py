@@ -53,7 +53,7 @@ class Policy:
         48,
         "",
         "modes of the observed side in which each component of it is described",
-        "misspecified, noise that neighbours share: 128 of one field along the normals held 55 % of 90 in place of 91 %",
+        "misspecified, noise that neighbours share: 128 of one field along normals held 55 % of 90, not 91 %",
     )
     discrepancy_spread: float = choice(
         0.25,

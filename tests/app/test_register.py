@@ -220,7 +220,7 @@ def test_rows_of_zeros_are_passed_over_and_counted_apart(plain_twin: Twin, cloud
     whole, row = rows["whole"], record_of(tmp_path / "holed")["frames"][0]
     assert row.pop("points_missing") == 3000 and "points_missing" not in whole
     assert row["points"] == 400 and row["points_left_out"] == 0 and row["rms_distance_m"] < 1e-3
-    for entry in ("rms_distance_m", "noise_m", "outliers", "points_alike", "informed", "targets"):
+    for entry in ("rms_distance_m", "noise_m", "outliers", "informed", "targets"):
         assert row[entry] == whole[entry], entry
     assert row["margins_in"] == "body"
     target = row["targets"]["tumour"]

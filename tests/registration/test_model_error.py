@@ -158,7 +158,7 @@ def test_the_derivative_of_the_distances_is_exact(body: Body, rng) -> None:
     evaluation, direction, step = problem.evaluation(at), rng.standard_normal(problem.size), 1e-6
     moving = problem.error_part.stop
     alone = problem.size - moving
-    assert moving == forces.size + 6 + 2 and alone == len(error.rest_modes.values) + 10
+    assert moving == forces.size + 6 + 2 and alone == len(error.rest_modes.values) + 3 * 10
 
     def near(sign: float) -> Evaluation:
         return problem.evaluation(at + sign * step * direction, evaluation)

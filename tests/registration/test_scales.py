@@ -131,7 +131,7 @@ def test_without_data_the_posterior_is_the_prior(body: Body, rng: np.random.Gene
     found, hyperprior = local.posterior(), given.hyperprior
     np.testing.assert_allclose(local.eta, hyperprior.median, atol=0.05)
     shared = POLICY.shared_size**2 * np.exp(observed.modes.spread(local.scales.length)[0])
-    variances = [np.full(given.forces.size, 0.05**2), np.ones(6 + 2), np.exp(error.rest_logs), shared]
+    variances = [np.full(given.forces.size, 0.05**2), np.ones(6 + 2), np.exp(error.rest_logs), np.tile(shared, 3)]
     np.testing.assert_allclose(np.diag(found.covariance), np.concatenate(variances), rtol=0.02)
     off = found.covariance - np.diag(np.diag(found.covariance))
     np.testing.assert_allclose(off, 0.0, atol=1e-12)
