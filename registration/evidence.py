@@ -28,6 +28,7 @@ Floats = NDArray[np.float64]
 # Logarithms of variances as functions of the logarithms eta of the hyperparameters, with their derivatives.
 Variances = Callable[[Floats], tuple[Floats, Floats]]
 _DESCENT = {"maxiter": 20, "ftol": 1e-8, "maxls": 10}
+_BEHIND = 30.0  # of the logarithm of the evidence: no descent begins so far behind the best so far
 _SETTLED = 2e-2  # of the logarithm of the evidence, by a logarithm of a scale
 _STEP = 0.02  # of a logarithm, for a difference
 _REACH = 14.0  # of a logarithm about the median: a factor of a million, beyond which sums lose their digits
@@ -180,8 +181,12 @@ class Evidence:
         # For each point: the first step of a bounded descent is as long as the gradient, and would end at a bound.
         share = 1.0 / max(float(self.problem.count.sum()), 1.0)
         options = {**_DESCENT, "gtol": share * _SETTLED}
-        for start in starts:
-            eta = hyperprior.within(start)
+        begun = [hyperprior.within(start) for start in starts]
+        values = [self.value(start)[0] if len(begun) > 1 else -np.inf for start in begun]
+        for place in np.argsort(values):
+            eta = begun[place]
+            if values[place] > lowest + _BEHIND:
+                break
 
             def cost(part: Floats, eta: Floats = eta) -> tuple[float, Floats]:
                 eta[sought] = part
@@ -189,8 +194,8 @@ class Evidence:
                 return share * value, share * gradient[sought]
 
             found = minimize(cost, eta[sought], jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-            if found.fun < lowest:
-                lowest = float(found.fun)
+            if found.fun < share * lowest:
+                lowest = float(found.fun) / share
                 best = eta.copy()
                 best[sought] = found.x
         return best

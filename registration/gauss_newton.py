@@ -107,7 +107,7 @@ class GaussNewton:
 
     Args:
         losses: one after the other.
-        max_iterations: of all losses together.
+        max_iterations: of all losses together; what neighbours share is sought in as many more.
         settled: a step shorter than this, in posterior deviations a coefficient, is not taken: it has converged.
         enough: where no step lowers the objective further, or iterations run out, a step shorter than this counts as
             settled: closest points jump from triangle to triangle, and no objective falls for ever.
@@ -202,7 +202,7 @@ class _Search:
         self.evaluations, self.limit = 1, self._first_limit
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
         self.own, self.begun = 0.0, 0
-        self.eta: Floats | None = eta
+        self.eta = self.before = eta
         self.trace: list[IterationRecord] = []
         self._at: LocalModel | None = None
 
@@ -233,7 +233,9 @@ class _Search:
         at = self._at
         if at is None or at.evaluation is not self.evaluation or at.loss is not loss:
             jacobian = None if at is None or at.evaluation is not self.evaluation else at.jacobian
-            starts = starts_of(self.problem, self.noise, self.eta) if at is None or at.loss is not loss else [at.eta]
+            is_begun = at is not None and at.loss is loss
+            known = [] if at is None or not is_begun else [at.eta]
+            starts = known or starts_of(self.problem, self.noise, self.eta, self.before)
             at = LocalModel(
                 self.problem, self.evaluation, loss, self.noise, self.options.graduation, jacobian, starts, self.own
             )
@@ -310,22 +312,29 @@ class _Search:
         return Outcome.REFUSED if unsolved else Outcome.NO_DESCENT
 
 
-def starts_of(problem: Problem, noise: float, eta: Floats | None = None) -> list[Floats]:
+def starts_of(problem: Problem, noise: float, eta: Floats | None = None, before: Floats | None = None) -> list[Floats]:
     """From where hyperparameters are sought when nothing near is known: without and with noise that is shared.
 
     Args:
         problem: what is registered.
         noise: standard deviation of a point's distance so far, metres.
-        eta: logarithms of the hyperparameters of a frame before; what is believed of them if not given.
+        eta: logarithms of the hyperparameters so far; what is believed of them if not given.
+        before: those of the frame before, whose shared noise is tried too.
     """
-    without = problem.hyperprior.median.copy() if eta is None else eta.copy()
+    median = problem.hyperprior.median
+    without = median.copy() if eta is None else eta.copy()
     without[NOISE] = np.log(noise)
     if problem.shared is None:
         return [without]
-    median, with_it = problem.hyperprior.median, without.copy()
-    without[SHARED] = median[SHARED]
-    with_it[SHARED], with_it[LENGTH] = np.log(noise), median[LENGTH]
-    return [without, with_it]
+    without[[SHARED, LENGTH]] = median[[SHARED, LENGTH]]
+    sizes = [(np.log(noise), median[LENGTH])]
+    if before is not None and before[SHARED] > median[SHARED]:
+        sizes.append((before[SHARED], before[LENGTH]))
+    found = [without]
+    for size, length in sizes:
+        found.append(without.copy())
+        found[-1][[SHARED, LENGTH]] = size, length
+    return found
 
 
 def _begun(problem: Problem, start: Floats, near: Evaluation | None) -> Evaluation:
