@@ -22,23 +22,27 @@ _SEEN = 1e-13  # information relative to the largest, below which a direction is
 
 @dataclass(frozen=True)
 class LogNormalPrior:
-    """What is believed of a positive scale beforehand: log-normal.
+    """What is believed of a positive scale beforehand: log-normal within bounds.
 
     Args:
         median: the scale expected.
         spread: standard deviation of its logarithm; 0 for a scale that is known.
         minimum: no smaller value is believed.
+        maximum: no larger value is believed.
     """
 
     median: float
     spread: float
     minimum: float = 0.0
+    maximum: float = np.inf
 
     def __post_init__(self) -> None:
         if not (0.0 < self.median < np.inf and 0.0 <= self.spread < np.inf and 0.0 <= self.minimum < np.inf):
             raise ValueError(
                 f"LogNormalPrior: expected a positive median, a spread and a least value of 0 or more, got {self}."
             )
+        if not self.maximum > 0.0:
+            raise ValueError(f"LogNormalPrior.maximum: expected a positive number, got {self.maximum}.")
 
     def with_minimum(self, minimum: float) -> LogNormalPrior:
         """The same belief with a larger least value."""
@@ -47,13 +51,14 @@ class LogNormalPrior:
     @cached_property
     def grid(self) -> tuple[Floats, Floats]:
         """Logarithms of values, multiples of one step, (g,), and the logarithm of their probability, (g,)."""
-        middle = np.log(max(self.median, self.minimum))
+        middle = np.log(min(max(self.median, self.minimum), self.maximum))
         if self.spread == 0.0:
             return np.round([middle / _STEP]) * _STEP, np.zeros(1)
         low = middle - _REACH * self.spread
         if self.minimum > 0.0:
             low = max(low, np.log(self.minimum))
-        steps = np.arange(np.ceil(low / _STEP), np.floor((middle + _REACH * self.spread) / _STEP) + 1)
+        high = min(middle + _REACH * self.spread, np.log(self.maximum))
+        steps = np.arange(np.ceil(low / _STEP), np.floor(high / _STEP) + 1)
         return _STEP * steps, -0.5 * ((_STEP * steps - np.log(self.median)) / self.spread) ** 2
 
 

@@ -1,0 +1,227 @@
+"""The hyperparameters of a registration at the maximum of Laplace's evidence, by its gradient.
+
+About a state the residuals are linear in the unknowns c: y = B c + noise of covariance D W^-1, and c has a normal law
+of variances v beforehand. D, a variance for each group of points, and v depend on the hyperparameters eta. The evidence
+p(y | eta) is that of a normal law with covariance D W^-1 + B v B' (MacKay 1992), diagonal plus low rank: by Woodbury's
+formula all of it comes from B' W B, B' W y and y' W y of each group, which are made once, and a trial of eta costs one
+factor of the unknowns' size. With m and S the mean and the covariance of the unknowns,
+
+    d(-log p) / d(log v_j) = (1 - (m_j^2 + S_jj) / v_j) / 2
+
+so that a block of unknowns tells its own scale, however that depends on eta, and so does a group of points.
+
+The registrar does not use it yet: `hyperparameters` finds noise and force scale on a grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.optimize import minimize
+
+from .hyperparameters import LogNormalPrior
+
+Floats = NDArray[np.float64]
+# Logarithms of variances as functions of the logarithms eta of the hyperparameters, with their derivatives.
+Variances = Callable[[Floats], tuple[Floats, Floats]]
+_DESCENT = {"maxiter": 20, "ftol": 1e-8, "maxls": 10}
+_BEHIND = 30.0  # of the logarithm of the evidence: no descent begins so far behind the best so far
+_SETTLED = 2e-2  # of the logarithm of the evidence, by a logarithm of a scale
+_STEP = 0.02  # of a logarithm, for a difference
+_REACH = 14.0  # of a logarithm about the median: a factor of a million, beyond which sums lose their digits
+
+
+@dataclass(frozen=True, eq=False)
+class LinearProblem:
+    """Residuals that are linear in unknowns, in the sums that the evidence needs: points in groups of like variance.
+
+    Args:
+        information: B' W B of each group, (g, k, k).
+        projection: B' W y, (g, k).
+        square: y' W y, (g,).
+        count: sums of the weights, (g,).
+        tail: what is added to the squares for the tails that robust weights have cut off, (g,).
+        known: the same as `information`, `projection` of residuals whose deviation is known, over its square.
+    """
+
+    information: Floats
+    projection: Floats
+    square: Floats
+    count: Floats
+    tail: Floats
+    known: tuple[Floats, Floats] | None = None
+
+    def weighted(self, precision: Floats) -> tuple[Floats, Floats]:
+        """B' W B and B' W y of all groups over their variances.
+
+        Args:
+            precision: of each group, (g,).
+        """
+        count = self.projection.shape[1]
+        matrix = (precision @ self.information.reshape(len(precision), -1)).reshape(count, count)
+        pull = precision @ self.projection
+        if self.known is not None:
+            matrix, pull = matrix + self.known[0], pull + self.known[1]
+        return matrix, pull
+
+
+@dataclass(frozen=True, eq=False)
+class Hyperprior:
+    """What is believed of the logarithms of the hyperparameters beforehand: normal and independent, within bounds.
+
+    Args:
+        median: (h,).
+        spread: standard deviations, (h,); 0 of one that is known.
+        lowest: (h,).
+        highest: (h,).
+    """
+
+    median: Floats
+    spread: Floats
+    lowest: Floats
+    highest: Floats
+
+    @classmethod
+    def of(cls, priors: Sequence[LogNormalPrior]) -> Hyperprior:
+        """The same of the scales themselves."""
+        rows = [(np.clip(each.median, each.minimum, each.maximum), each.minimum, each.maximum) for each in priors]
+        with np.errstate(divide="ignore"):
+            median, lowest, highest = np.log(np.array(rows)).T
+        spread = np.array([each.spread for each in priors])
+        reach = np.where(spread > 0.0, _REACH, np.inf)
+        return cls(median, spread, np.maximum(lowest, median - reach), np.minimum(highest, median + reach))
+
+    def with_minimum(self, place: int, value: float) -> Hyperprior:
+        """The same with a larger least value of one."""
+        lowest = self.lowest.copy()
+        lowest[place] = max(lowest[place], value)
+        return replace(self, lowest=lowest, highest=np.maximum(self.highest, lowest))
+
+    @cached_property
+    def is_sought(self) -> NDArray[np.bool_]:
+        """Which are not known, (h,)."""
+        return (self.spread > 0.0) & (self.highest > self.lowest)
+
+    def within(self, eta: Floats) -> Floats:
+        """Values within the bounds, those that are known as they are."""
+        found: Floats = np.clip(np.where(self.spread > 0.0, eta, self.median), self.lowest, self.highest)
+        return found
+
+    def cost(self, eta: Floats) -> tuple[float, Floats]:
+        """Minus the logarithm of the density, and its gradient."""
+        scaled = np.where(self.spread > 0.0, eta - self.median, 0.0) / np.where(self.spread > 0.0, self.spread, 1.0)
+        return 0.5 * float(scaled @ scaled), scaled / np.where(self.spread > 0.0, self.spread, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Minus the logarithm of the evidence times what is believed, as a function of the hyperparameters.
+
+    Args:
+        problem: about a state.
+        noise: logarithms of the groups' variances, (g,), and their derivatives, (h, g).
+        prior: logarithms of the unknowns' variances, (k,), and their derivatives, (h, k).
+        hyperprior: of the hyperparameters.
+    """
+
+    problem: LinearProblem
+    noise: Variances
+    prior: Variances
+    hyperprior: Hyperprior
+
+    def value(self, eta: Floats) -> tuple[float, Floats]:
+        """At logarithms of the hyperparameters, (h,), with the gradient, (h,)."""
+        problem = self.problem
+        (noise, by_noise), (logs, slopes) = self.noise(eta), self.prior(eta)
+        precision, root = np.exp(-noise), np.exp(0.5 * logs)
+        matrix, pull = problem.weighted(precision)
+        matrix = matrix * root[:, None] * root
+        matrix[np.diag_indices(len(root))] += 1.0
+        factor, failed = dpotrf(matrix, lower=True, overwrite_a=True)
+        if failed:
+            return np.inf, np.zeros_like(eta)
+        half = float(np.log(np.diag(factor)).sum())
+        inverse, _ = dpotri(factor, lower=True, overwrite_c=True)  # its lower triangle
+        inverse = np.tril(inverse) + np.tril(inverse, -1).T
+        mean = inverse @ (root * pull)  # over the roots of the variances
+        believed, gradient = self.hyperprior.cost(eta)
+        square = float(precision @ (problem.square + problem.tail))
+        value = 0.5 * float(problem.count @ noise) + half + 0.5 * (square - float(mean @ (root * pull))) + believed
+        gradient = gradient + 0.5 * slopes @ (1.0 - mean**2 - np.diag(inverse))
+        # y' W y - 2 m' B' W y + tr(B' W B (m m' + S)) of each group, over its variance
+        moved = root * mean
+        second = inverse * root[:, None] * root + moved[:, None] * moved
+        data = problem.square + problem.tail - 2.0 * problem.projection @ moved
+        data = data + problem.information.reshape(len(noise), -1) @ second.ravel()
+        return value, gradient + 0.5 * by_noise @ (problem.count - precision * data)
+
+    def mean(self, eta: Floats) -> Floats:
+        """The unknowns' posterior mean at logarithms of the hyperparameters, (k,)."""
+        root = np.exp(0.5 * self.prior(eta)[0])
+        matrix, pull = self.problem.weighted(np.exp(-self.noise(eta)[0]))
+        matrix = matrix * root[:, None] * root
+        matrix[np.diag_indices(len(root))] += 1.0 + np.finfo(float).eps * np.trace(matrix)
+        found: Floats = root * np.linalg.solve(matrix, root * pull)
+        return found
+
+    def maximum(self, starts: Sequence[Floats]) -> Floats:
+        """The most likely logarithms of the hyperparameters, (h,): the best of the descents from several starts.
+
+        Args:
+            starts: (h,) each, at least one.
+        """
+        hyperprior, sought = self.hyperprior, self.hyperprior.is_sought
+        best, lowest = hyperprior.within(starts[0]), np.inf
+        if not sought.any():
+            return best
+        bounds = np.column_stack([hyperprior.lowest, hyperprior.highest])[sought]
+        # For each point: the first step of a bounded descent is as long as the gradient, and would end at a bound.
+        share = 1.0 / max(float(self.problem.count.sum()), 1.0)
+        options = {**_DESCENT, "gtol": share * _SETTLED}
+        begun = [hyperprior.within(start) for start in starts]
+        values = [self.value(start)[0] if len(begun) > 1 else -np.inf for start in begun]
+        for place in np.argsort(values):
+            eta = begun[place]
+            if values[place] > lowest + _BEHIND:
+                break
+
+            def cost(part: Floats, eta: Floats = eta) -> tuple[float, Floats]:
+                eta[sought] = part
+                value, gradient = self.value(eta)
+                return share * value, share * gradient[sought]
+
+            found = minimize(cost, eta[sought], jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+            if found.fun < share * lowest:
+                lowest = float(found.fun) / share
+                best = eta.copy()
+                best[sought] = found.x
+        return best
+
+    def covariance(self, eta: Floats) -> Floats:
+        """Of the logarithms of the hyperparameters, by the curvature at the maximum, (h, h).
+
+        One that lies at a bound is taken as known.
+
+        Args:
+            eta: at the maximum, (h,).
+        """
+        hyperprior = self.hyperprior
+        inside = (eta > hyperprior.lowest + _STEP) & (eta < hyperprior.highest - _STEP)
+        places = np.flatnonzero(hyperprior.is_sought & inside)
+        covariance = np.zeros((len(eta), len(eta)))
+        if not len(places):
+            return covariance
+        here, rows = self.value(eta)[1], []
+        for place in places:
+            moved = eta.copy()
+            moved[place] += _STEP
+            rows.append((self.value(moved)[1] - here)[places] / _STEP)
+        values, vectors = np.linalg.eigh(0.5 * (np.array(rows) + np.array(rows).T))
+        flattest = 1.0 / hyperprior.spread[places].max() ** 2  # what is believed makes it no flatter than that
+        covariance[np.ix_(places, places)] = (vectors / np.maximum(values, flattest)) @ vectors.T
+        return covariance
