@@ -62,10 +62,10 @@ class LinearProblem:
         """
         count = self.projection.shape[1]
         matrix = (precision @ self.information.reshape(len(precision), -1)).reshape(count, count)
-        pull = precision @ self.projection
+        projection = precision @ self.projection
         if self.known is not None:
-            matrix, pull = matrix + self.known[0], pull + self.known[1]
-        return matrix, pull
+            matrix, projection = matrix + self.known[0], projection + self.known[1]
+        return matrix, projection
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class Evidence:
         problem = self.problem
         (noise, by_noise), (logs, slopes) = self.noise(eta), self.prior(eta)
         precision, root = np.exp(-noise), np.exp(0.5 * logs)
-        matrix, pull = problem.weighted(precision)
+        matrix, projection = problem.weighted(precision)
         matrix = matrix * root[:, None] * root
         matrix[np.diag_indices(len(root))] += 1.0
         factor, failed = dpotrf(matrix, lower=True, overwrite_a=True)
@@ -146,10 +146,12 @@ class Evidence:
         half = float(np.log(np.diag(factor)).sum())
         inverse, _ = dpotri(factor, lower=True, overwrite_c=True)  # its lower triangle
         inverse = np.tril(inverse) + np.tril(inverse, -1).T
-        mean = inverse @ (root * pull)  # over the roots of the variances
+        mean = inverse @ (root * projection)  # over the roots of the variances
         believed, gradient = self.hyperprior.cost(eta)
         square = float(precision @ (problem.square + problem.tail))
-        value = 0.5 * float(problem.count @ noise) + half + 0.5 * (square - float(mean @ (root * pull))) + believed
+        value = (
+            0.5 * float(problem.count @ noise) + half + 0.5 * (square - float(mean @ (root * projection))) + believed
+        )
         gradient = gradient + 0.5 * slopes @ (1.0 - mean**2 - np.diag(inverse))
         # y' W y - 2 m' B' W y + tr(B' W B (m m' + S)) of each group, over its variance
         moved = root * mean
@@ -161,10 +163,10 @@ class Evidence:
     def mean(self, eta: Floats) -> Floats:
         """The unknowns' posterior mean at logarithms of the hyperparameters, (k,)."""
         root = np.exp(0.5 * self.prior(eta)[0])
-        matrix, pull = self.problem.weighted(np.exp(-self.noise(eta)[0]))
+        matrix, projection = self.problem.weighted(np.exp(-self.noise(eta)[0]))
         matrix = matrix * root[:, None] * root
         matrix[np.diag_indices(len(root))] += 1.0 + np.finfo(float).eps * np.trace(matrix)
-        found: Floats = root * np.linalg.solve(matrix, root * pull)
+        found: Floats = root * np.linalg.solve(matrix, root * projection)
         return found
 
     def maximum(self, starts: Sequence[Floats]) -> Floats:
@@ -172,6 +174,9 @@ class Evidence:
 
         Args:
             starts: (h,) each, at least one.
+
+        Raises:
+            ArithmeticError: the evidence is finite at none of them.
         """
         hyperprior, sought = self.hyperprior, self.hyperprior.is_sought
         best, lowest = hyperprior.within(starts[0]), np.inf
@@ -194,10 +199,12 @@ class Evidence:
                 return share * value, share * gradient[sought]
 
             found = minimize(cost, eta[sought], jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-            if found.fun < share * lowest:
+            if np.isfinite(found.fun) and found.fun < share * lowest:
                 lowest = float(found.fun) / share
                 best = eta.copy()
                 best[sought] = found.x
+        if not np.isfinite(lowest):
+            raise ArithmeticError("Evidence.maximum: the evidence is finite at none of the starts.")
         return best
 
     def covariance(self, eta: Floats) -> Floats:
@@ -219,7 +226,8 @@ class Evidence:
             moved = eta.copy()
             moved[place] += _STEP
             rows.append((self.value(moved)[1] - here)[places] / _STEP)
-        values, vectors = np.linalg.eigh(0.5 * (np.array(rows) + np.array(rows).T))
-        flattest = 1.0 / hyperprior.spread[places].max() ** 2  # what is believed makes it no flatter than that
-        covariance[np.ix_(places, places)] = (vectors / np.maximum(values, flattest)) @ vectors.T
+        spread = hyperprior.spread[places]
+        values, vectors = np.linalg.eigh(0.5 * (np.array(rows) + np.array(rows).T) * spread[:, None] * spread)
+        root = spread[:, None] * vectors / np.sqrt(np.maximum(values, 1.0))  # in no direction wider than was believed
+        covariance[np.ix_(places, places)] = root @ root.T
         return covariance

@@ -58,7 +58,12 @@ class SurfaceModes:
 
         Returns:
             (q,) and (q,).
+
+        Raises:
+            ValueError: a length or a smoothness that is not positive.
         """
+        if not (0.0 < length < np.inf and 0.0 < smoothness < np.inf):
+            raise ValueError(f"SurfaceModes.spread: expected positive numbers, got {length} and {smoothness}.")
         base = 2.0 * smoothness / length**2
         falling = -(smoothness + 1.0) * np.log(base + self.values)
         sloped = 2.0 * (smoothness + 1.0) * base / (base + self.values)
@@ -76,8 +81,15 @@ def surface_modes(points: Floats, triangles: Ints, count: int) -> SurfaceModes:
     Args:
         points: vertices, (v, 3), metres.
         triangles: (t, 3).
-        count: most modes wanted.
+        count: largest number of modes; there are at most two fewer than vertices.
+
+    Raises:
+        ValueError: fewer than three vertices, no mode wanted, points that are not finite, or a surface without area.
     """
+    if len(points) < 3 or count < 1:
+        raise ValueError(f"surface_modes: expected 3 vertices and 1 mode at least, got {len(points)} and {count}.")
+    if not np.isfinite(points).all() or not np.ptp(points, axis=0).any():
+        raise ValueError("surface_modes.points: expected finite places that are apart, got NaN, or one place alone.")
     stiffness, mass = _laplacian(points, triangles)
     count = min(count, len(points) - 2)
     root = 1.0 / np.sqrt(mass)

@@ -146,3 +146,17 @@ def test_priors_say_what_is_wrong() -> None:
     with pytest.raises(ValueError, match="maximum: expected a positive number, got 0"):
         LogNormalPrior(1.0, 1.0, maximum=0.0)
     assert LogNormalPrior(1.0, 1.0).with_minimum(2.0).minimum == 2.0
+
+
+def test_an_evidence_that_is_nowhere_finite_is_no_maximum(rng: np.random.Generator) -> None:
+    """The start is not given back as if it were one."""
+    drawn = Drawn(rng, np.log([0.3, 2.0, 0.2]))
+    broken = replace(drawn.problem, information=-1e6 * drawn.problem.information)
+    with pytest.raises(ArithmeticError, match="finite at none of the starts"):
+        replace(drawn.evidence, problem=broken).maximum([np.log([0.3, 2.0, 0.2])])
+
+
+def test_no_doubt_is_wider_than_what_was_believed(rng: np.random.Generator) -> None:
+    evidence = Drawn(rng, np.log([0.3, 2.0, 0.2])).evidence
+    found = evidence.covariance(evidence.maximum([np.log([0.3, 2.0, 0.2])]))
+    assert (np.diag(found) <= np.square(evidence.hyperprior.spread) + 1e-12).all() and (np.diag(found) > 0.0).all()

@@ -92,3 +92,15 @@ def test_surfaces_in_pieces_and_with_flat_triangles_have_modes() -> None:
     flat = np.concatenate([triangles, [[0, 1, 2]]])
     assert np.isfinite(surface_modes(points, flat, 20).modes).all()
     assert len(surface_modes(points[[0, 1, 12]], np.array([[0, 1, 2]]), 20).values) == 1
+
+
+def test_what_is_no_surface_and_no_length_is_refused() -> None:
+    points, triangles = rectangle(12, 8)
+    with pytest.raises(ValueError, match="3 vertices and 1 mode at least, got 2"):
+        surface_modes(points[:2], triangles[:0], 4)
+    with pytest.raises(ValueError, match="got NaN"):
+        surface_modes(np.where(points == 0.0, np.nan, points), triangles, 4)
+    with pytest.raises(ValueError, match="one place alone"):
+        surface_modes(np.zeros_like(points), triangles, 4)
+    with pytest.raises(ValueError, match=r"expected positive numbers, got 0\.0"):
+        surface_modes(points, triangles, 4).spread(0.0)
