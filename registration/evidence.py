@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from scipy.optimize import minimize
 
 from .hyperparameters import LogNormalPrior
@@ -27,9 +27,9 @@ from .hyperparameters import LogNormalPrior
 Floats = NDArray[np.float64]
 # Logarithms of variances as functions of the logarithms eta of the hyperparameters, with their derivatives.
 Variances = Callable[[Floats], tuple[Floats, Floats]]
-_DESCENT = {"maxiter": 20, "ftol": 1e-8, "maxls": 10}
+_DESCENT = {"maxiter": 20, "ftol": 1e-6, "maxls": 10}
 _BEHIND = 30.0  # of the logarithm of the evidence: no descent begins so far behind the best so far
-_SETTLED = 2e-2  # of the logarithm of the evidence, by a logarithm of a scale
+_SETTLED = 0.3  # of the logarithm of the evidence, by a logarithm of a scale
 _STEP = 0.02  # of a logarithm, for a difference
 _REACH = 14.0  # of a logarithm about the median: a factor of a million, beyond which sums lose their digits
 
@@ -54,6 +54,13 @@ class LinearProblem:
     tail: Floats
     known: tuple[Floats, Floats] | None = None
 
+    @cached_property
+    def upper(self) -> Floats:
+        """B' W B of each group so that its product with a symmetric matrix reads that one's upper triangle, (g, k k)."""
+        count = self.projection.shape[1]
+        doubled = 2.0 * np.triu(np.ones((count, count))) - np.eye(count)
+        return (self.information * doubled).reshape(len(self.information), -1)
+
     def weighted(self, precision: Floats) -> tuple[Floats, Floats]:
         """B' W B and B' W y of all groups over their variances.
 
@@ -64,7 +71,8 @@ class LinearProblem:
         matrix = (precision @ self.information.reshape(len(precision), -1)).reshape(count, count)
         projection = precision @ self.projection
         if self.known is not None:
-            matrix, projection = matrix + self.known[0], projection + self.known[1]
+            matrix += self.known[0]
+            projection += self.known[1]
         return matrix, projection
 
 
@@ -138,27 +146,31 @@ class Evidence:
         (noise, by_noise), (logs, slopes) = self.noise(eta), self.prior(eta)
         precision, root = np.exp(-noise), np.exp(0.5 * logs)
         matrix, projection = problem.weighted(precision)
-        matrix = matrix * root[:, None] * root
+        matrix *= root[:, None]
+        matrix *= root
         matrix[np.diag_indices(len(root))] += 1.0
-        factor, failed = dpotrf(matrix, lower=True, overwrite_a=True)
+        factor, failed = dpotrf(matrix.T, lower=True, clean=False, overwrite_a=True)  # by columns: nothing is copied
         if failed:
             return np.inf, np.zeros_like(eta)
         half = float(np.log(np.diag(factor)).sum())
-        inverse, _ = dpotri(factor, lower=True, overwrite_c=True)  # its lower triangle
-        inverse = np.tril(inverse) + np.tril(inverse, -1).T
-        mean = inverse @ (root * projection)  # over the roots of the variances
+        projection = root * projection
+        mean, _ = dpotrs(factor, projection, lower=True)  # over the roots of the variances
+        inverse, _ = dpotri(factor, lower=True, overwrite_c=True)
         believed, gradient = self.hyperprior.cost(eta)
         square = float(precision @ (problem.square + problem.tail))
-        value = (
-            0.5 * float(problem.count @ noise) + half + 0.5 * (square - float(mean @ (root * projection))) + believed
-        )
+        value = 0.5 * float(problem.count @ noise) + half + 0.5 * (square - float(mean @ projection)) + believed
         gradient = gradient + 0.5 * slopes @ (1.0 - mean**2 - np.diag(inverse))
         # y' W y - 2 m' B' W y + tr(B' W B (m m' + S)) of each group, over its variance
-        moved = root * mean
-        second = inverse * root[:, None] * root + moved[:, None] * moved
-        data = problem.square + problem.tail - 2.0 * problem.projection @ moved
-        data = data + problem.information.reshape(len(noise), -1) @ second.ravel()
+        moved, second = root * mean, inverse.T  # of it the upper triangle counts
+        second *= root[:, None]
+        second *= root
+        second += moved[:, None] * moved
+        data = problem.square + problem.tail - 2.0 * problem.projection @ moved + problem.upper @ second.ravel()
         return value, gradient + 0.5 * by_noise @ (problem.count - precision * data)
+
+    def information(self, eta: Floats) -> Floats:
+        """B' W B over the points' variances, with that of known deviations, at the hyperparameters, (k, k)."""
+        return self.problem.weighted(np.exp(-self.noise(eta)[0]))[0]
 
     def mean(self, eta: Floats) -> Floats:
         """The unknowns' posterior mean at logarithms of the hyperparameters, (k,)."""

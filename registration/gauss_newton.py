@@ -21,6 +21,7 @@ from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .posterior import Posterior
 from .problem import Evaluation, Problem
+from .score import gain_by_shared_noise
 
 Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
@@ -117,6 +118,7 @@ class GaussNewton:
         minimum_step: no step that moves all observed nodes less than this is tried, metres.
         trusted: before the end closest points are searched anew, of points further from the surface than so many of
             their deviations; 0 for all.
+        keeps_scales: hyperparameters that are known at the start are sought anew with the last loss alone.
         until: no step is begun after this time of the monotonic clock, seconds.
     """
 
@@ -129,6 +131,7 @@ class GaussNewton:
     max_step: float = 0.05
     minimum_step: float = 1e-6
     trusted: float = 0.0
+    keeps_scales: bool = False
     until: float = np.inf
 
     def __post_init__(self) -> None:
@@ -152,8 +155,8 @@ class GaussNewton:
         return replace(self, settled=self.handed_on)
 
     def following(self) -> GaussNewton:
-        """The same from the state of a frame before: feet found by walking stay feet over so short a way."""
-        return replace(self, trusted=max(self.trusted, _TRUSTED))
+        """The same from the state of a frame before: closest points and scales stay the same over so short a way."""
+        return replace(self, trusted=max(self.trusted, _TRUSTED), keeps_scales=True)
 
     def without_steps(self) -> GaussNewton:
         """The same, which takes any start for the end: to judge it."""
@@ -197,7 +200,6 @@ class _Search:
     ) -> None:
         self.options, self.whole = options, problem
         self.problem = problem if len(options.losses) == 1 else problem.unshared
-        start = start if len(start) == self.problem.size else start[: self.problem.size]
         self.evaluation = _begun(self.problem, start, near)
         self.evaluations, self.limit = 1, self._first_limit
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
@@ -213,14 +215,16 @@ class _Search:
     def run(self) -> SolverResult:
         options = self.options
         ended = [self._descend(loss, options.handed_on) for loss in options.losses[:-1]]
-        if self.problem is not self.whole:  # first what points far off are told by, then what neighbours share
-            ended.append(self._descend(options.losses[-1], options.settled, _UNSHARED))
+        last, outcome = options.losses[-1], Outcome.CONVERGED
+        if self.problem is not self.whole:  # points far off are told first, then what neighbours share
+            outcome = self._descend(last, options.settled, _UNSHARED)
             self.begun = len(self.trace)
-            self.problem, self._at = self.whole, None
-            grown = np.zeros(self.whole.size)
-            grown[: len(self.evaluation.coefficients)] = self.evaluation.coefficients
-            self.evaluation = replace(self.evaluation, coefficients=grown)
-        outcome = self._descend(options.losses[-1], options.settled)
+            if outcome is not Outcome.CONVERGED and not self._is_shared(last):
+                outcome = self._descend(last, options.settled)
+        if self.problem is self.whole or self._is_shared(last):
+            ended.append(outcome)
+            self._take_whole()
+            outcome = self._descend(last, options.settled)
         if outcome in (Outcome.NO_DESCENT, Outcome.MAXIMUM_ITERATIONS, Outcome.OUT_OF_TIME) and self._has_enough():
             outcome = Outcome.CONVERGED
         if Outcome.OUT_OF_TIME in ended:  # far off, the last loss takes all points for outliers, and is content
@@ -228,16 +232,34 @@ class _Search:
         local = self._local(self.options.losses[-1])
         return SolverResult.at(local, outcome, self.evaluations, tuple(self.trace))
 
+    def _is_shared(self, loss: Loss) -> bool:
+        """Whether noise that neighbours share may make the cloud more likely than what is believed of it costs."""
+        return gain_by_shared_noise(self._local(loss), self.whole) > 0.0
+
+    def _take_whole(self) -> None:
+        if self.problem is not self.whole:
+            self.problem, self._at = self.whole, None
+            coefficients = _sized(self.evaluation.coefficients, self.whole.size)
+            self.evaluation = replace(self.evaluation, coefficients=coefficients)
+
     def _local(self, loss: Loss) -> LocalModel:
         """The model about the trial; what is known there already is not computed again."""
         at = self._at
         if at is None or at.evaluation is not self.evaluation or at.loss is not loss:
             jacobian = None if at is None or at.evaluation is not self.evaluation else at.jacobian
-            is_begun = at is not None and at.loss is loss
-            known = [] if at is None or not is_begun else [at.eta]
+            is_held = self.options.keeps_scales and self.before is not None and loss is not self.options.losses[-1]
+            known = [] if at is None or at.loss is not loss else [at.eta]
             starts = known or starts_of(self.problem, self.noise, self.eta, self.before)
             at = LocalModel(
-                self.problem, self.evaluation, loss, self.noise, self.options.graduation, jacobian, starts, self.own
+                self.problem,
+                self.evaluation,
+                loss,
+                self.noise,
+                self.options.graduation,
+                jacobian,
+                starts,
+                self.own,
+                is_held=is_held,
             )
             self._at, self.noise, self.own, self.eta = at, at.noise, at.own, at.eta
         return at
@@ -337,11 +359,21 @@ def starts_of(problem: Problem, noise: float, eta: Floats | None = None, before:
     return found
 
 
+def _sized(coefficients: Floats, count: int) -> Floats:
+    """The first so many, and zeros behind them: what neighbours share comes last."""
+    found = np.zeros(count)
+    found[: len(coefficients)] = coefficients[:count]
+    return found
+
+
 def _begun(problem: Problem, start: Floats, near: Evaluation | None) -> Evaluation:
     """The trial at the start: the one given, where it is of this cloud and has just these coefficients."""
+    sized = start if len(start) == problem.size else _sized(start, problem.size)
     if near is None or near.cloud is not problem.cloud:
-        return problem.evaluation(start, near, anew=True)
-    return near if near.coefficients is start else problem.evaluation(start, near)
+        return problem.evaluation(sized, near, anew=True)
+    if near.coefficients is not start:
+        return problem.evaluation(sized, near)
+    return near if sized is start else replace(near, coefficients=sized)
 
 
 def _next_limit(limit: float, taken: float, gain: float) -> float:
@@ -364,6 +396,7 @@ class LocalModel:
         jacobian: of the distances at the trial, (p, k), where it is known.
         starts: logarithms of hyperparameters that the search for them begins with; those that are believed if none.
         own: the points' own noise so far, metres, without what is yet to be explained; None for all of it.
+        is_held: the hyperparameters are the first of the starts, and not sought.
     """
 
     def __init__(
@@ -376,26 +409,31 @@ class LocalModel:
         jacobian: Floats | None = None,
         starts: Sequence[Floats] = (),
         own: float | None = None,
+        *,
+        is_held: bool = False,
     ) -> None:
         self.problem, self.evaluation, self.loss = problem, evaluation, loss
         self.was_whole, self.own = True, noise if own is None else own
         self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
         off, leaning = problem.landmark_residuals(evaluation), problem.normal_residuals(evaluation)
-        self.landmark_information, by_landmarks = _told(
-            off, landmarks.LOSS, lambda: problem.landmark_jacobian(evaluation)
-        )
-        self.normal_information, by_normals = _told(leaning, loss, lambda: problem.normal_jacobian(evaluation))
-        self._beside = by_landmarks + by_normals
-        self.rough = problem.rough(evaluation)
-        self.eta, self.is_graduated = self._found(noise, graduation, list(starts))
+        by_marks, pull_by_marks = _told(off, landmarks.LOSS, lambda: problem.landmark_jacobian(evaluation))
+        by_normals, pull_by_normals = _told(leaning, loss, lambda: problem.normal_jacobian(evaluation))
+        self._known, self._beside = by_marks + by_normals, pull_by_marks + pull_by_normals
+        self._groups, self.rough = _grouped(problem.rough(evaluation))
+        start = problem.hyperprior.within(starts[0]) if len(starts) else _believed(problem, noise)
+        self._evidence = self._evidence_near(start, noise)
+        if is_held:
+            self.eta, self.is_graduated = start, False
+        else:
+            self.eta, self.is_graduated = self._found(graduation, list(starts) or [start])
         self.scales = Hyperparameters(*np.exp(self.eta))
         self.noise = self.scales.noise
         self.deviations = np.hypot(self.noise, self.rough)
         residuals = problem.residuals(evaluation, self.own)
         self.weights = loss.weight(residuals / self.deviations)
         self.precision = np.exp(-problem.prior_variances(self.eta)[0])
-        self.information = self._products(self.weights / self.deviations**2)
-        self._hessian = self.information + self.landmark_information + self.normal_information + np.diag(self.precision)
+        self._informed = self._evidence.information(self.eta)
+        self._hessian = self._informed + np.diag(self.precision)
         self.gradient = self._gradient(residuals, self.weights)
         self.value = self.objective(evaluation, loss)
 
@@ -403,48 +441,39 @@ class LocalModel:
         by_distances = weights * residuals / self.deviations**2
         return by_distances @ self.jacobian + self.precision * self.evaluation.coefficients + self._beside
 
-    def _products(self, weights: Floats) -> Floats:
-        trusted = np.sqrt(weights)[:, None] * self.jacobian
-        found: Floats = trusted.T @ trusted
-        return found
-
-    def _evidence(self, noise: float, eta: Floats) -> Evidence:
-        """Of the hyperparameters, with the weights that the points have at some noise, metres.
+    def _evidence_near(self, eta: Floats, noise: float) -> Evidence:
+        """Of the hyperparameters, with the weights that the points have at some noise.
 
         Weights cut tails off: what a normal law has there is added to the squares of what the linear model leaves.
 
         Args:
-            noise: standard deviation of a point's distance, metres.
             eta: logarithms of hyperparameters near those sought, (5,).
+            noise: standard deviation of a point's distance, metres.
         """
-        problem, coefficients = self.problem, self.evaluation.coefficients
+        problem, coefficients, groups = self.problem, self.evaluation.coefficients, self._groups
         residuals = problem.residuals(self.evaluation, self.own)
         weights = self.loss.weight(residuals / np.hypot(noise, self.rough))
         data = self.jacobian @ coefficients - residuals
-        known = self.landmark_information + self.normal_information
-        groups = _groups(self.rough)
-        trusted = np.sqrt(weights)[:, None] * self.jacobian
+        root = np.sqrt(weights)
+        parts = [root[group, None] * self.jacobian[group] for group in groups]
+        known = None if isinstance(self._known, float) else (self._known, self._known @ coefficients - self._beside)
         linear = LinearProblem(
-            np.stack([trusted[group].T @ trusted[group] for group in groups]),
-            np.stack([(weights[group] * data[group]) @ self.jacobian[group] for group in groups]),
+            np.stack([part.T @ part for part in parts]),
+            np.stack([(root[group] * data[group]) @ part for group, part in zip(groups, parts, strict=True)]),
             np.array([data[group] @ (weights[group] * data[group]) for group in groups]),
             np.array([weights[group].sum() for group in groups]),
             np.zeros(len(groups)),
-            None if isinstance(known, float) else (known, known @ coefficients - self._beside),
+            known,
         )
-        there = np.sqrt([np.mean(self.rough[group] ** 2) for group in groups])
+        there = np.array([self.rough[group[0]] for group in groups])
         found = Evidence(linear, problem.noise_variances(there), problem.prior_variances, problem.hyperprior)
         left = weights * (data - self.jacobian @ found.mean(eta)) ** 2
         beyond = 1.0 / self.loss.consistency - 1.0
         return replace(found, problem=replace(linear, tail=np.array([beyond * left[group].sum() for group in groups])))
 
-    def _found(self, noise: float, graduation: float, starts: list[Floats]) -> tuple[Floats, bool]:
+    def _found(self, graduation: float, starts: list[Floats]) -> tuple[Floats, bool]:
         """Logarithms of the hyperparameters, and whether the noise is held above what the model would believe."""
-        if not starts:
-            start = self.problem.hyperprior.median.copy()
-            start[NOISE] = np.log(noise)
-            starts = [start]
-        evidence = self._evidence(noise, self.problem.hyperprior.within(starts[0]))
+        evidence = self._evidence
         eta = evidence.maximum(starts)
         self.own = float(np.exp(eta[NOISE]))
         minimum = np.log(max(graduation * self._promised(evidence, eta), 1e-300))
@@ -541,32 +570,39 @@ class LocalModel:
 
     def posterior(self) -> Posterior:
         """Laplace's approximation at the trial, with what the doubt of the hyperparameters moves."""
-        root = 1.0 / np.sqrt(self.precision)
-        inverse = np.linalg.inv(self._scaled_hessian)
-        covariance = root[:, None] * inverse * root
-        told = self.information + self.landmark_information + self.normal_information
-        shares = np.einsum("ij,ji->i", covariance, told)
+        covariance = self.solved(np.eye(self.problem.size))
+        shares = np.einsum("ij,ji->i", covariance, self._informed)
         informed = float(shares[: self.problem.error_part.stop].sum())
         moved, spread = self._by_hyperparameters(covariance)
         return Posterior(self.evaluation.coefficients, covariance + moved @ spread @ moved.T, self.scales, informed)
 
     def _by_hyperparameters(self, covariance: Floats) -> tuple[Floats, Floats]:
         """Derivative of the mean by the logarithms of the hyperparameters, (k, h), and their covariance, (h, h)."""
-        evidence = self._evidence(self.noise, self.eta)
         _, slopes = self.problem.prior_variances(self.eta)
         held = self.precision * self.evaluation.coefficients
         columns = (slopes * held).T
         residuals = self.problem.residuals(self.evaluation, self.own)
         share = (self.noise / self.deviations) ** 2  # of a distance's variance that is its own noise
         columns[:, NOISE] = 2.0 * (share * self.weights * residuals / self.deviations**2) @ self.jacobian
-        return covariance @ columns, evidence.covariance(self.eta)
+        return covariance @ columns, self._evidence.covariance(self.eta)
 
 
-def _groups(rough: Floats) -> list[NDArray[np.int64]]:
-    """Points of like variance: numbers of those in each group."""
+def _believed(problem: Problem, noise: float) -> Floats:
+    """What is believed of the hyperparameters, and a noise, metres."""
+    start = problem.hyperprior.median.copy()
+    start[NOISE] = np.log(noise)
+    return problem.hyperprior.within(start)
+
+
+def _grouped(rough: Floats) -> tuple[list[NDArray[np.int64]], Floats]:
+    """Points of like variance: numbers of those in each group, and the root mean square of it for each point, (p,)."""
     if not rough.any():
-        return [np.arange(len(rough))]
-    return [group for group in np.array_split(np.argsort(rough), _GROUPS) if len(group)]
+        return [np.arange(len(rough))], rough
+    groups = [group for group in np.array_split(np.argsort(rough), _GROUPS) if len(group)]
+    alike = np.empty_like(rough)
+    for group in groups:
+        alike[group] = np.sqrt(np.mean(rough[group] ** 2))
+    return groups, alike
 
 
 def _told(off: Floats, loss: Loss, jacobian: Callable[[], Floats]) -> tuple[Floats | float, Floats | float]:

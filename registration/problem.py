@@ -171,14 +171,20 @@ class Problem:
     def _by_distances(self, evaluation: Evaluation) -> Floats:
         """Derivative of the residuals by the coefficients that change the distances alone, (p, q)."""
         match, columns = evaluation.match, [np.zeros((len(self.cloud), 0))]
-        corners = self.observed.triangles[match.triangles]
         if self.error is not None:
+            corners = self.observed.triangles[match.triangles]
             there = self.observed.at_points(match, self.error.distance_deviation)
             columns.append(-there[:, None] * self.error.rest_modes.at(corners, match.weights))
         if self.shared is not None:
-            modes = self.shared.at(corners, match.weights)
-            columns += [-along[:, None] * modes for along in match.directions.T]
+            columns.append(self.by_shared_noise(evaluation))
         return np.hstack(columns)
+
+    def by_shared_noise(self, evaluation: Evaluation) -> Floats:
+        """Derivative of the residuals by the coefficients of the noise that neighbours share, (p, 3 q)."""
+        assert self.shared is not None
+        match = evaluation.match
+        modes = self.shared.at(self.observed.triangles[match.triangles], match.weights)
+        return np.hstack([-along[:, None] * modes for along in match.directions.T])
 
     def carried(self, coefficients: Floats, before: Problem) -> Floats:
         """Coefficients of another problem for a start of this one, (k,); what it did not have is zero.
@@ -199,9 +205,9 @@ class Problem:
     @cached_property
     def hyperprior(self) -> Hyperprior:
         """What is believed of the hyperparameters, in their order."""
-        never = LogNormalPrior(1.0, 0.0)
-        scale = self.forces.scale
-        priors = [self.noise, scale if self.forces.size else replace(scale, spread=0.0), never, never, never]
+        one, scale = LogNormalPrior(1.0, 0.0), self.forces.scale
+        none = LogNormalPrior(POLICY.shared_size, 0.0)
+        priors = [self.noise, scale if self.forces.size else replace(scale, spread=0.0), none, one, one]
         if self.shared is not None:
             least = POLICY.shared_length_minimum * self.observed.edge
             median = max(POLICY.shared_length * np.sqrt(self.shared.area), least)

@@ -236,7 +236,6 @@ class Registrar:
         start = np.zeros(problem.size)
         start[problem.force_part] = prepared.forces.nearest(draft.unknown_forces)
         start[problem.pose_part] = draft.coefficients[draft.problem.pose_part]
-        start[problem.noise_part] = draft.coefficients[draft.problem.noise_part]
         found = self._approached(problem, problem.begun(start, draft.evaluation), fast, solver, draft.eta)
         return self._finished(points, prepared, found, begin)
 
@@ -267,11 +266,12 @@ class Registrar:
             if not way.trace or self._is_late:
                 break
             try:
-                near = problem.evaluation(way.evaluation.coefficients, replace(way.evaluation, state=near.state))
+                exact = problem if way.local.problem.shared is not None else problem.unshared
+                near = exact.evaluation(way.evaluation.coefficients, replace(way.evaluation, state=near.state))
             except NotConverged:
                 break
             spent.append(replace(way, evaluations=1))  # states of the exact model alone are counted
-            if solver.has_settled(problem, near, way.local.noise, eta):
+            if solver.has_settled(exact, near, way.local.noise, eta):
                 break
         if near.cloud is not problem.cloud:
             near = problem.begun(near.coefficients.copy(), near)
@@ -369,7 +369,7 @@ class Registrar:
         if is_hopeless:
             solver = solver.without_steps()
         believed = prepared if self.error is not None else self._believed(prepared, found)
-        problem, before = self._problem(points, believed, found), self._plain(points, prepared)
+        problem, before = self._problem(points, believed, found), found.local.problem
         is_settled = is_settled and believed is prepared and len(found.evaluation.cloud) == len(points)
         if self.error is not None or not is_settled:
             start = problem.carried(found.evaluation.coefficients, before)
@@ -432,7 +432,7 @@ class Registrar:
         return self.pose.mean, pose.then(self.pose.mean.inverse())
 
     def _result(self, problem: Problem, found: SolverResult, prepared: Prepared, begin: float) -> Registration:
-        discrepancy_scale = found.local.scales.discrepancy
+        problem, discrepancy_scale = found.local.problem, found.local.scales.discrepancy
         evaluation, net = found.evaluation, problem.net_forces(found.evaluation)
         nodal = problem.nodal_forces(evaluation)
         total = nodal.sum(axis=0)

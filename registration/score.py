@@ -9,14 +9,20 @@ weights make the statistic smaller where the model is right, so that chances are
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from .gauss_newton import LocalModel
+from .hyperparameters import LENGTH, SHARED
+
+if TYPE_CHECKING:
+    from .gauss_newton import LocalModel
+    from .problem import Problem
 
 Floats = NDArray[np.float64]
+_LENGTHS = 5  # of noise that neighbours share, from the least to the largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,19 +50,54 @@ def score(local: LocalModel, columns: Floats) -> Score | None:
         local: the objective's model there.
         columns: derivative of the distances by the parameters, (p, m).
     """
-    weights = local.weights / local.deviations**2
-    weighted = weights[:, None] * columns
-    across = local.jacobian.T @ weighted
-    solved = local.solved(across)
-    information = columns.T @ weighted - across.T @ solved
-    # What the last step, which was not taken, would still change of the residuals counts, too.
-    pull = solved.T @ local.gradient - weighted.T @ local.problem.residuals(local.evaluation, local.own)
+    pull, information = _pull(local, columns)
     values, vectors = np.linalg.eigh(information)
-    scale = np.diag(columns.T @ weighted).max(initial=0.0)
-    if not len(values) or not values[0] > np.finfo(float).eps * len(weights) * scale:
+    scale = float(np.square(columns / local.deviations[:, None]).sum(axis=0).max(initial=0.0))
+    if not len(values) or not values[0] > np.finfo(float).eps * len(columns) * scale:
         return None
     estimate = vectors @ ((vectors.T @ pull) / values)
     return Score(estimate, float(pull @ estimate))
+
+
+def _pull(local: LocalModel, columns: Floats) -> tuple[Floats, Floats]:
+    """Slope of the logarithm of the likelihood by parameters at zero, (m,), and its expected covariance, (m, m)."""
+    weighted = (local.weights / local.deviations**2)[:, None] * columns
+    across = local.jacobian.T @ weighted
+    solved = local.solved(across)
+    # What the last step, which was not taken, would still change of the residuals counts, too.
+    pull = solved.T @ local.gradient - weighted.T @ local.problem.residuals(local.evaluation, local.own)
+    return pull, columns.T @ weighted - across.T @ solved
+
+
+def gain_by_shared_noise(local: LocalModel, problem: Problem) -> float:
+    """What noise that neighbours share may add to the logarithm of the evidence, beyond what is believed of it.
+
+    About none the logarithm is U t - I t^2 / 2 in the variance t of such noise, with U = (s' V s - tr(M V)) / 2 and
+    I = tr(M V M V) / 2, where s is the slope by the modes' coefficients, M its covariance, V the modes' variances for a
+    length: U^2 / (2 I) at most. Robust weights make s smaller than M tells, which is made good.
+
+    Args:
+        local: the objective's model at the end of a registration without shared noise.
+        problem: the same with it.
+    """
+    modes, hyperprior = problem.shared, problem.hyperprior
+    if modes is None:
+        return -np.inf
+    pull, covariance = _pull(local, problem.by_shared_noise(local.evaluation))
+    weights, scaled = local.weights, local.problem.residuals(local.evaluation, local.own) / local.deviations
+    shrunk = float(np.sum((weights * scaled) ** 2) / max(weights.sum(), 1e-300))
+    squares, products = pull**2 / max(shrunk, 1e-300), covariance**2
+    best = -np.inf
+    for length in np.linspace(hyperprior.lowest[LENGTH], hyperprior.highest[LENGTH], _LENGTHS):
+        variances = np.tile(np.exp(modes.spread(float(np.exp(length)))[0]), 3)
+        slope = 0.5 * float(variances @ (squares - np.diag(covariance)))
+        bend = 0.5 * float(variances @ products @ variances)
+        if slope <= 0.0:
+            continue
+        size = np.clip(0.5 * np.log(slope / bend), hyperprior.lowest[SHARED], hyperprior.highest[SHARED])
+        beside = (size - hyperprior.median[SHARED]) / hyperprior.spread[SHARED]
+        best = max(best, 0.5 * slope**2 / bend - 0.5 * float(beside**2))
+    return best
 
 
 def by_scale(local: LocalModel) -> Floats:
