@@ -1,19 +1,19 @@
-"""Closest points of triangle surfaces, at rest and while their vertices move, by VTK's static cell locator."""
+"""Closest points of triangle surfaces, at rest and while their vertices move, by libigl's tree of boxes."""
 
 from __future__ import annotations
 
-from typing import Any
-
+import igl
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-from vtkmodules.vtkCommonCore import mutable, vtkPoints
-from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkGenericCell, vtkPolyData, vtkStaticCellLocator
+from vtkmodules.vtkCommonCore import vtkPoints
+from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData, vtkStaticCellLocator
 
 from .body import Floats, Ints, Surface
 
 _LONGEST_WALK = 60  # triangles that a point may cross
+_FEW = 2_500  # triangles: for so many a tree is built and asked as fast as points walk
 _TINY = 1e-300  # a triangle without area divides by it
 _ROUNDING = 1e-15  # of a squared distance, relative to the square of the surface's extent
 
@@ -36,7 +36,7 @@ def polydata(surface: Surface) -> vtkPolyData:
 
 
 def cell_locator(surface: Surface) -> vtkStaticCellLocator:
-    """A VTK locator of the surface's triangles, for closest points and intersections.
+    """A VTK locator of the surface's triangles, for intersections.
 
     Args:
         surface: triangle surface, metres.
@@ -54,16 +54,13 @@ def closest_points(surface: Surface, points: Floats) -> tuple[Floats, Ints]:
         surface: triangle surface, metres.
         points: positions, (p, 3), metres.
     """
-    locator = cell_locator(surface)
-    nearest, triangles = np.empty_like(points), np.empty(len(points), dtype=np.int64)
-    found = [0.0, 0.0, 0.0]
-    cell: Any = mutable(0)  # VTK writes its answers into these
-    part: Any = mutable(0)
-    square: Any = mutable(0.0)
-    for i, point in enumerate(points):
-        locator.FindClosestPoint(point.tolist(), found, cell, part, square)
-        nearest[i], triangles[i] = found, int(cell)
-    return nearest, triangles
+    _, triangles, nearest = igl.point_mesh_squared_distance(_plain(points), _plain(surface.points), surface.triangles)
+    return nearest, np.asarray(triangles, dtype=np.int64)
+
+
+def _plain(points: Floats) -> Floats:
+    """As libigl takes them."""
+    return np.ascontiguousarray(points, dtype=np.float64)
 
 
 def distances(surface: Surface, points: Floats) -> Floats:
@@ -88,16 +85,6 @@ class ClosestPoints:
         self.triangles = np.ascontiguousarray(triangles, dtype=np.int64)
         self._stars, self._rings = _stars_and_rings(self.triangles, vertices)
         self._used = np.unique(self.triangles)
-        self._points, cells = vtkPoints(), vtkCellArray()
-        self._points.SetDataTypeToDouble()
-        self._points.SetNumberOfPoints(vertices)
-        offsets: Ints = np.arange(0, self.triangles.size + 1, 3)
-        cells.SetData(
-            numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(self.triangles.ravel(), deep=True)
-        )
-        self._surface = vtkPolyData()
-        self._surface.SetPoints(self._points)
-        self._surface.SetPolys(cells)
 
     def find(self, positions: Floats, cloud: Floats) -> tuple[Ints, Floats]:
         """Triangle, (p,), and barycentric weights, (p, 3), of the closest point on the surface for each of a cloud.
@@ -106,29 +93,24 @@ class ClosestPoints:
             positions: where the vertices are now, (n, 3), metres.
             cloud: points, (p, 3), metres.
         """
-        self._points.SetData(numpy_to_vtk(np.ascontiguousarray(positions), deep=True))
-        self._points.Modified()
-        locator = vtkStaticCellLocator()
-        locator.SetDataSet(self._surface)
-        locator.BuildLocator()
-        cell = vtkGenericCell()
-        number: Any = mutable(0)  # VTK writes its answers into these
-        part: Any = mutable(0)
-        squared: Any = mutable(0.0)
-        place = [0.0, 0.0, 0.0]
-        found = np.empty(len(cloud), dtype=np.int64)
-        for i, point in enumerate(cloud.tolist()):
-            locator.FindClosestPoint(point, place, cell, number, part, squared)
-            found[i] = number.get()
+        found = igl.point_mesh_squared_distance(_plain(cloud), _plain(positions), self.triangles)[1]
+        found = np.asarray(found, dtype=np.int64)
         return found, closest_in_triangles(positions[self.triangles[found]], cloud)[0]
 
+    @property
+    def is_small(self) -> bool:
+        """Whether all points are searched for anew each time: no walk is faster."""
+        return len(self.triangles) <= _FEW
+
     def near(self, positions: Floats, cloud: Floats) -> tuple[Ints, Floats]:
-        """The same by walking from the nearest vertex: a local minimum of the distance, found in half of the time.
+        """The same of a large surface by walking from the nearest vertex: a local minimum of the distance, found faster.
 
         Args:
             positions: where the vertices are now, (n, 3), metres.
             cloud: points, (p, 3), metres.
         """
+        if self.is_small:
+            return self.find(positions, cloud)
         tree = cKDTree(positions[self._used], balanced_tree=False, compact_nodes=False)  # asked once: built fast
         star = self._stars[self._used[tree.query(cloud)[1]]]
         return self._walked(positions, cloud, *self._best(positions, cloud, star))
@@ -144,13 +126,15 @@ class ClosestPoints:
         return choice[rows, best], tried[place[rows, best]], squares[rows, best]
 
     def follow(self, positions: Floats, cloud: Floats, near: Ints) -> tuple[Ints, Floats]:
-        """The same by walking from triangle to triangle: a local minimum of the distance, found in a tenth of the time.
+        """The same of a large surface by walking from triangle to triangle: a local minimum of the distance.
 
         Args:
             positions: where the vertices are now, (n, 3), metres.
             cloud: points, (p, 3), metres.
             near: triangles to start from, (p,).
         """
+        if self.is_small:
+            return self.find(positions, cloud)
         weights, squares = closest_in_triangles(positions[self.triangles[near]], cloud)
         return self._walked(positions, cloud, near.copy(), weights, squares)
 

@@ -26,10 +26,10 @@ from .hyperparameters import LogNormalPrior
 
 Floats = NDArray[np.float64]
 # Logarithms of variances as functions of the logarithms eta of the hyperparameters, with their derivatives.
+Known = tuple[float, Floats]  # a value and its gradient
 Variances = Callable[[Floats], tuple[Floats, Floats]]
-_DESCENT = {"maxiter": 20, "ftol": 1e-6, "maxls": 10}
+_DESCENT = {"maxiter": 20, "ftol": 1e-7, "gtol": 0.1, "maxls": 10}  # of a standard deviation of a logarithm
 _BEHIND = 30.0  # of the logarithm of the evidence: no descent begins so far behind the best so far
-_SETTLED = 0.3  # of the logarithm of the evidence, by a logarithm of a scale
 _STEP = 0.02  # of a logarithm, for a difference
 _REACH = 14.0  # of a logarithm about the median: a factor of a million, beyond which sums lose their digits
 
@@ -118,6 +118,11 @@ class Hyperprior:
         found: Floats = np.clip(np.where(self.spread > 0.0, eta, self.median), self.lowest, self.highest)
         return found
 
+    @cached_property
+    def bend(self) -> Floats:
+        """Second derivatives of the cost, (h,)."""
+        return 1.0 / np.where(self.spread > 0.0, self.spread, 1.0) ** 2
+
     def cost(self, eta: Floats) -> tuple[float, Floats]:
         """Minus the logarithm of the density, and its gradient."""
         scaled = np.where(self.spread > 0.0, eta - self.median, 0.0) / np.where(self.spread > 0.0, self.spread, 1.0)
@@ -142,6 +147,10 @@ class Evidence:
 
     def value(self, eta: Floats) -> tuple[float, Floats]:
         """At logarithms of the hyperparameters, (h,), with the gradient, (h,)."""
+        return self._at(eta)[:2]
+
+    def _at(self, eta: Floats) -> tuple[float, Floats, Floats]:
+        """The same with about the second derivative by each: that expected of right hyperparameters, (h,)."""
         problem = self.problem
         (noise, by_noise), (logs, slopes) = self.noise(eta), self.prior(eta)
         precision, root = np.exp(-noise), np.exp(0.5 * logs)
@@ -151,7 +160,7 @@ class Evidence:
         matrix[np.diag_indices(len(root))] += 1.0
         factor, failed = dpotrf(matrix.T, lower=True, clean=False, overwrite_a=True)  # by columns: nothing is copied
         if failed:
-            return np.inf, np.zeros_like(eta)
+            return np.inf, np.zeros_like(eta), np.ones_like(eta)
         half = float(np.log(np.diag(factor)).sum())
         projection = root * projection
         mean, _ = dpotrs(factor, projection, lower=True)  # over the roots of the variances
@@ -159,14 +168,16 @@ class Evidence:
         believed, gradient = self.hyperprior.cost(eta)
         square = float(precision @ (problem.square + problem.tail))
         value = 0.5 * float(problem.count @ noise) + half + 0.5 * (square - float(mean @ projection)) + believed
-        gradient = gradient + 0.5 * slopes @ (1.0 - mean**2 - np.diag(inverse))
+        told = 1.0 - np.diag(inverse)
+        gradient = gradient + 0.5 * slopes @ (told - mean**2)
+        bend = self.hyperprior.bend + 0.5 * (slopes**2 @ told**2 + by_noise**2 @ problem.count)
         # y' W y - 2 m' B' W y + tr(B' W B (m m' + S)) of each group, over its variance
         moved, second = root * mean, inverse.T  # of it the upper triangle counts
         second *= root[:, None]
         second *= root
         second += moved[:, None] * moved
         data = problem.square + problem.tail - 2.0 * problem.projection @ moved + problem.upper @ second.ravel()
-        return value, gradient + 0.5 * by_noise @ (problem.count - precision * data)
+        return value, gradient + 0.5 * by_noise @ (problem.count - precision * data), bend
 
     def information(self, eta: Floats) -> Floats:
         """B' W B over the points' variances, with that of known deviations, at the hyperparameters, (k, k)."""
@@ -195,26 +206,27 @@ class Evidence:
         if not sought.any():
             return best
         bounds = np.column_stack([hyperprior.lowest, hyperprior.highest])[sought]
-        # For each point: the first step of a bounded descent is as long as the gradient, and would end at a bound.
-        share = 1.0 / max(float(self.problem.count.sum()), 1.0)
-        options = {**_DESCENT, "gtol": share * _SETTLED}
-        begun = [hyperprior.within(start) for start in starts]
-        values = [self.value(start)[0] if len(begun) > 1 else -np.inf for start in begun]
-        for place in np.argsort(values):
-            eta = begun[place]
-            if values[place] > lowest + _BEHIND:
+        begun = [(start, *self._at(start)) for start in map(hyperprior.within, starts)]
+        for start, first, slope, bend in sorted(begun, key=lambda at: at[1]):
+            if first > lowest + _BEHIND:
                 break
+            # In standard deviations of each: a bounded descent's first step is as long as the gradient.
+            place, unit = start[sought], 1.0 / np.sqrt(bend[sought])
+            known = (first, slope[sought] * unit)
 
-            def cost(part: Floats, eta: Floats = eta) -> tuple[float, Floats]:
-                eta[sought] = part
-                value, gradient = self.value(eta)
-                return share * value, share * gradient[sought]
+            def cost(part: Floats, start: Floats = start, unit: Floats = unit, known: Known = known) -> Known:
+                if not part.any():
+                    return known
+                eta = start.copy()
+                eta[sought] += unit * part
+                value, gradient, _ = self._at(eta)
+                return value, gradient[sought] * unit
 
-            found = minimize(cost, eta[sought], jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-            if np.isfinite(found.fun) and found.fun < share * lowest:
-                lowest = float(found.fun) / share
-                best = eta.copy()
-                best[sought] = found.x
+            within = (bounds - place[:, None]) / unit[:, None]
+            found = minimize(cost, np.zeros(len(place)), jac=True, method="L-BFGS-B", bounds=within, options=_DESCENT)
+            if np.isfinite(found.fun) and found.fun < lowest:
+                lowest, best = float(found.fun), start.copy()
+                best[sought] = hyperprior.within(start + _put(sought, unit * found.x))[sought]
         if not np.isfinite(lowest):
             raise ArithmeticError("Evidence.maximum: the evidence is finite at none of the starts.")
         return best
@@ -243,3 +255,10 @@ class Evidence:
         root = spread[:, None] * vectors / np.sqrt(np.maximum(values, 1.0))  # in no direction wider than was believed
         covariance[np.ix_(places, places)] = root @ root.T
         return covariance
+
+
+def _put(places: NDArray[np.bool_], values: Floats) -> Floats:
+    """Values at some places, zero elsewhere, (h,)."""
+    found = np.zeros(len(places))
+    found[places] = values
+    return found

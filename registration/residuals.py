@@ -130,6 +130,8 @@ class SurfaceDistance:
             near: a match at this displacement.
             distance: metres; what is closer may lie closer still at another place, but no more than that.
         """
+        if self._closest.is_small:
+            return near
         far = np.flatnonzero(np.abs(near.distances) > distance) if distance > 0.0 else np.arange(len(cloud))
         if not len(far):
             return near

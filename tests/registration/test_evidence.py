@@ -93,8 +93,9 @@ def test_scales_that_data_were_drawn_with_are_found_within_their_doubt() -> None
     for seed in range(60):
         evidence = Drawn(np.random.default_rng(seed), truth).evidence
         found = evidence.maximum([np.log([1.0, 1.0, 0.1])])
-        assert np.abs(evidence.value(found)[1]).max() < 0.2
-        off.append((found - truth) / np.sqrt(np.diag(evidence.covariance(found))))
+        deviations = np.sqrt(np.diag(evidence.covariance(found)))
+        assert np.abs(evidence.value(found)[1] * deviations).max() < 0.2  # of them, to the maximum
+        off.append((found - truth) / deviations)
     scores = np.array(off)
     assert np.abs(scores.mean(axis=0)).max() < 0.45  # standard errors of 0.13, and the prior's pull
     assert ((scores**2).mean(axis=0) > 0.5).all() and ((scores**2).mean(axis=0) < 1.9).all()
@@ -104,7 +105,7 @@ def test_the_better_of_two_descents_counts(rng: np.random.Generator) -> None:
     evidence = Drawn(rng, np.log([0.3, 2.0, 0.2])).evidence
     starts = [np.log([3.0, 1e-3, 1e-3]), np.log([0.3, 2.0, 0.2])]
     both, values = evidence.maximum(starts), [evidence.value(evidence.maximum([start]))[0] for start in starts]
-    assert evidence.value(both)[0] == pytest.approx(min(values))
+    assert evidence.value(both)[0] == pytest.approx(min(values), abs=0.01)
 
 
 def test_scales_that_are_known_stay_and_bounds_hold(rng: np.random.Generator) -> None:
