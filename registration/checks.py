@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, chdtri, ndtr
 
 from softtwin.meshes.metrics import displacement_gradients
 
@@ -217,7 +217,7 @@ def _log_normal(value: float, prior: LogNormalPrior) -> tuple[str, float] | None
     """The chance of so large a scale by what was believed of it."""
     if prior.spread == 0.0:
         return None
-    chance = float(norm.sf(np.log(value / max(prior.median, prior.minimum)) / prior.spread)) if value > 0.0 else 1.0
+    chance = float(ndtr(-np.log(value / max(prior.median, prior.minimum)) / prior.spread)) if value > 0.0 else 1.0
     return "log-normal prior of the noise", chance
 
 
@@ -311,7 +311,7 @@ def _pose(problem: Problem, found: SolverResult, expected: Expectations) -> Iter
 
 def _largest_normal(value: float, count: int) -> tuple[str, float]:
     """The chance of so large a deviation, the largest of several by its prior."""
-    chance = _of_several(2.0 * float(norm.sf(value)), count)
+    chance = _of_several(2.0 * float(ndtr(-value)), count)
     return f"largest of {count} standard normal deviations" if count > 1 else "standard normal", chance
 
 
@@ -335,7 +335,7 @@ def _left_out(problem: Problem, found: SolverResult) -> Iterator[Check]:
 
 def _scored(code: Code, told: Score, matters: bool, reason: str) -> Check:
     """A check by a score test; what is sure and too small to matter is passed."""
-    level = float(chi2.isf(_UNLIKELY, len(told.estimate)))
+    level = float(chdtri(len(told.estimate), _UNLIKELY))
     law = f"chi-square, {len(told.estimate)} degrees of freedom", told.p_value
     made = _check(code, told.statistic, level, reason, law=law)
     return made if matters else replace(made, verdict=Verdict.ACCEPTED, level=None, reason="")
@@ -401,7 +401,7 @@ def _landmarks(problem: Problem, found: SolverResult) -> Iterator[Check]:
     off = np.linalg.norm(problem.landmark_residuals(found.evaluation).reshape(-1, 3), axis=1)
     number, largest = int(off.argmax()), float(off.max())
     away = f"landmark {number} lies {1e3 * problem.landmarks.deviation * largest:.1f} mm from where it was found"
-    chance = _of_several(float(chi2.sf(largest**2, 3)), len(off))
+    chance = _of_several(float(chdtrc(3, largest**2)), len(off))
     yield _check(
         Code.LANDMARKS,
         largest,

@@ -148,10 +148,6 @@ class GaussNewton:
         few = min(self.max_iterations, _ROUGH)
         return replace(self, losses=self.losses[:1], settled=self.handed_on, max_iterations=few)
 
-    def last(self) -> GaussNewton:
-        """The same with the last loss alone: from where all have been."""
-        return replace(self, losses=self.losses[-1:])
-
     def unsettled(self) -> GaussNewton:
         """The same, ended early: where another goes on from there."""
         return replace(self, settled=self.handed_on)
@@ -201,7 +197,7 @@ class _Search:
         self, options: GaussNewton, problem: Problem, start: Floats, near: Evaluation | None, eta: Floats | None
     ) -> None:
         self.options, self.whole = options, problem
-        self.problem = problem if len(options.losses) == 1 else problem.unshared
+        self.problem = problem.unshared
         self.evaluation = _begun(self.problem, start, near)
         self.evaluations, self.limit = 1, self._first_limit
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)

@@ -55,10 +55,6 @@ class LBFGS:
         """The same with the first loss alone: for a start."""
         return replace(self, losses=self.losses[:1])
 
-    def last(self) -> LBFGS:
-        """The same with the last loss alone: from where all have been."""
-        return replace(self, losses=self.losses[-1:])
-
     def unsettled(self) -> LBFGS:
         """The same: where it ends is not known before."""
         return self

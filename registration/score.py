@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from .hyperparameters import LENGTH, SHARED
 
@@ -40,7 +40,7 @@ class Score:
     @property
     def p_value(self) -> float:
         """Chance of so large a statistic where all are zero."""
-        return float(chi2.sf(self.statistic, len(self.estimate)))
+        return float(chdtrc(len(self.estimate), self.statistic))
 
 
 def score(local: LocalModel, columns: Floats) -> Score | None:
@@ -61,12 +61,13 @@ def score(local: LocalModel, columns: Floats) -> Score | None:
 
 def _pull(local: LocalModel, columns: Floats) -> tuple[Floats, Floats]:
     """Slope of the logarithm of the likelihood by parameters at zero, (m,), and its expected covariance, (m, m)."""
-    weighted = (local.weights / local.deviations**2)[:, None] * columns
-    across = local.jacobian.T @ weighted
+    root = np.sqrt(local.weights) / local.deviations
+    weighted, residuals = root[:, None] * columns, local.problem.residuals(local.evaluation, local.own)
+    across = (root[:, None] * local.jacobian).T @ weighted
     solved = local.solved(across)
     # What the last step, which was not taken, would still change of the residuals counts, too.
-    pull = solved.T @ local.gradient - weighted.T @ local.problem.residuals(local.evaluation, local.own)
-    return pull, columns.T @ weighted - across.T @ solved
+    pull = solved.T @ local.gradient - (root * residuals) @ weighted
+    return pull, weighted.T @ weighted - across.T @ solved
 
 
 def gain_by_shared_noise(local: LocalModel, problem: Problem) -> float:
