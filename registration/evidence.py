@@ -157,7 +157,7 @@ class Evidence:
         matrix, projection = problem.weighted(precision)
         matrix *= root[:, None]
         matrix *= root
-        matrix[np.diag_indices(len(root))] += 1.0
+        matrix[np.diag_indices(len(root))] += 1.0 + _rounding(matrix)
         factor, failed = dpotrf(matrix.T, lower=True, clean=False, overwrite_a=True)  # by columns: nothing is copied
         if failed:
             return np.inf, np.zeros_like(eta), np.ones_like(eta)
@@ -179,16 +179,12 @@ class Evidence:
         data = problem.square + problem.tail - 2.0 * problem.projection @ moved + problem.upper @ second.ravel()
         return value, gradient + 0.5 * by_noise @ (problem.count - precision * data), bend
 
-    def information(self, eta: Floats) -> Floats:
-        """B' W B over the points' variances, with that of known deviations, at the hyperparameters, (k, k)."""
-        return self.problem.weighted(np.exp(-self.noise(eta)[0]))[0]
-
     def mean(self, eta: Floats) -> Floats:
         """The unknowns' posterior mean at logarithms of the hyperparameters, (k,)."""
         root = np.exp(0.5 * self.prior(eta)[0])
         matrix, projection = self.problem.weighted(np.exp(-self.noise(eta)[0]))
         matrix = matrix * root[:, None] * root
-        matrix[np.diag_indices(len(root))] += 1.0 + np.finfo(float).eps * np.trace(matrix)
+        matrix[np.diag_indices(len(root))] += 1.0 + _rounding(matrix)
         found: Floats = root * np.linalg.solve(matrix, root * projection)
         return found
 
@@ -262,3 +258,8 @@ def _put(places: NDArray[np.bool_], values: Floats) -> Floats:
     found = np.zeros(len(places))
     found[places] = values
     return found
+
+
+def _rounding(matrix: Floats) -> float:
+    """What is lost of a diagonal where unknowns of very different sizes are told."""
+    return float(np.finfo(float).eps * np.trace(matrix))

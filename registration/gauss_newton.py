@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -31,7 +30,6 @@ _KEPT = 0.2  # a whole step that misses its promise by less: where only a start 
 _TRUSTED = 3.0  # deviations
 _NEARER = 1e-3  # part of the objective that closest points searched anew must take away to go on
 _GROUPS = 6  # of points, by how far the model's error makes them doubtful
-_NEAR = 0.5  # posterior deviations, and part of the step before: derivatives are kept over a shorter one
 _UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
 
 
@@ -243,8 +241,6 @@ class _Search:
     def _local(self, loss: Loss) -> LocalModel:
         """The model about the trial; what is known there already is not computed again."""
         at = self._at
-        if at is not None and at.loss is loss and at.evaluation is not self.evaluation and at.is_near:
-            self._at = at = at.moved_to(self.evaluation)
         if at is None or at.evaluation is not self.evaluation or at.loss is not loss:
             jacobian = None if at is None or at.evaluation is not self.evaluation else at.jacobian
             is_held = self.options.keeps_scales and self.before is not None and loss is not self.options.losses[-1]
@@ -414,7 +410,6 @@ class LocalModel:
     ) -> None:
         self.problem, self.evaluation, self.loss = problem, evaluation, loss
         self.was_whole, self.own = True, noise if own is None else own
-        self._length_before = 2.0
         self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
         off, leaning = problem.landmark_residuals(evaluation), problem.normal_residuals(evaluation)
         by_marks, pull_by_marks = _told(off, landmarks.LOSS, lambda: problem.landmark_jacobian(evaluation))
@@ -433,7 +428,8 @@ class LocalModel:
         residuals = problem.residuals(evaluation, self.own)
         self.weights = loss.weight(residuals / self.deviations)
         self.precision = np.exp(-problem.prior_variances(self.eta)[0])
-        self._informed = self._evidence.information(self.eta)
+        trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
+        self._informed = trusted.T @ trusted + self._known
         self._hessian = self._informed + np.diag(self.precision)
         self.gradient = self._gradient(residuals, self.weights)
         self.value = self.objective(evaluation, loss)
@@ -545,25 +541,6 @@ class LocalModel:
         residuals = self.problem.residuals(evaluation, self.own)
         gradient = self._gradient(residuals, self.loss.weight(residuals / self.deviations))
         return _length(self._whole_for(gradient), gradient)
-
-    @property
-    def is_near(self) -> bool:
-        """Whether derivatives and hyperparameters hold for the next trial, too: a step shorter than the doubt."""
-        return self.length < _NEAR * self._length_before and not self.is_graduated
-
-    def moved_to(self, evaluation: Evaluation) -> LocalModel:
-        """The same about another trial that is near, with these derivatives and hyperparameters."""
-        other = copy.copy(self)
-        other.__dict__.pop("_whole", None)
-        other._length_before = self.length
-        residuals = self.problem.residuals(evaluation, self.own)
-        other.evaluation, other.was_whole = evaluation, True
-        other.weights = self.loss.weight(residuals / self.deviations)
-        if not isinstance(self._known, float):
-            other._beside = self._beside + self._known @ (evaluation.coefficients - self.evaluation.coefficients)
-        other.gradient = other._gradient(residuals, other.weights)
-        other.value = other.objective(evaluation, self.loss)
-        return other
 
     def _damped(self, damping: float) -> Floats:
         values, vectors = self._eigen
