@@ -147,6 +147,23 @@ def test_closest_points_are_the_closest(body: Body, observed: SurfaceDistance, r
     assert (found <= brute + 1e-12).all() and (brute - found).max() < 5e-3  # sampling finds nothing nearer
 
 
+@pytest.fixture
+def walking(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Closest points are walked to on a small surface, too."""
+    monkeypatch.setattr("softtwin.meshes.closest._FEW", 0)
+
+
+def test_on_a_small_surface_all_are_searched_anew(body: Body, observed: SurfaceDistance, rng) -> None:
+    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement
+    cloud, moved = cloud_on(body, truth, 300, rng, 5e-3), truth[observed.nodes]
+    exact = observed.match(moved, cloud)
+    astray = replace(exact, triangles=np.zeros(300, dtype=int))
+    for found in (observed.match(moved, cloud, astray), observed.match_nearby(moved, cloud)):
+        np.testing.assert_array_equal(found.distances, exact.distances)
+    assert observed.match_beyond(moved, cloud, exact, 0.0) is exact
+
+
+@pytest.mark.usefixtures("walking")
 def test_following_finds_what_searching_finds(body: Body, rng) -> None:
     """After a move, but for a few points beside an edge, where a local minimum is not the global one."""
     closest = ClosestPoints(body.surfaces["observed"], len(body.points))
@@ -165,6 +182,7 @@ def test_following_finds_what_searching_finds(body: Body, rng) -> None:
     assert np.isclose(*lengths, atol=1e-12).mean() > 0.9
 
 
+@pytest.mark.usefixtures("walking")
 def test_a_point_between_two_triangles_stays(body: Body, rng, monkeypatch: pytest.MonkeyPatch) -> None:
     """Feet on edges and vertices are as near on each triangle but for rounding: no going to and fro."""
     closest = ClosestPoints(body.surfaces["observed"], len(body.points))
@@ -176,6 +194,7 @@ def test_a_point_between_two_triangles_stays(body: Body, rng, monkeypatch: pytes
     assert asked[0] > 20 and len(asked) <= 2
 
 
+@pytest.mark.usefixtures("walking")
 def test_only_far_points_are_searched_anew(body: Body, observed: SurfaceDistance, rng) -> None:
     truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement
     cloud, moved = cloud_on(body, truth, 300, rng, 5e-3), truth[observed.nodes]
@@ -188,6 +207,7 @@ def test_only_far_points_are_searched_anew(body: Body, observed: SurfaceDistance
     np.testing.assert_array_equal(observed.match_beyond(moved, cloud, astray, 0.0).distances, exact)
 
 
+@pytest.mark.usefixtures("walking")
 def test_the_nearest_vertex_leads_to_the_closest_point(body: Body, observed: SurfaceDistance, rng) -> None:
     """Of points near the surface; those that it does not lead there are farther off than the closest, never nearer."""
     truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement[observed.nodes]
