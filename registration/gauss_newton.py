@@ -200,7 +200,8 @@ class _Search:
         self.evaluations, self.limit = 1, self._first_limit
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
         self.own, self.begun = 0.0, 0
-        self.eta = self.before = eta
+        self.eta, self.starts = eta, list[Floats]()
+        self.keeps_scales = options.keeps_scales and eta is not None
         self.trace: list[IterationRecord] = []
         self._at: LocalModel | None = None
 
@@ -211,16 +212,18 @@ class _Search:
     def run(self) -> SolverResult:
         options = self.options
         ended = [self._descend(loss, options.handed_on) for loss in options.losses[:-1]]
-        last, outcome = options.losses[-1], Outcome.CONVERGED
-        if self.problem is not self.whole:  # points far off are told first, then what neighbours share
-            outcome = self._descend(last, options.settled, _UNSHARED)
-            self.begun = len(self.trace)
-            if outcome is not Outcome.CONVERGED and not self._is_shared(last):
-                outcome = self._descend(last, options.settled)
-        if self.problem is self.whole or self._is_shared(last):
-            ended.append(outcome)
-            self._take_whole()
+        last = options.losses[-1]
+        if self.problem is self.whole:
             outcome = self._descend(last, options.settled)
+        else:  # points far off are told first, then what neighbours share
+            outcome = self._descend(last, options.settled, _UNSHARED)
+            self.begun, shared = len(self.trace), self._shared(last)
+            if shared is None and outcome is not Outcome.CONVERGED:
+                outcome = self._descend(last, options.settled)
+                shared = self._shared(last)
+            if shared is not None and self._takes_whole(shared, last):
+                ended.append(outcome)
+                outcome = self._descend(last, options.settled)
         if outcome in (Outcome.NO_DESCENT, Outcome.MAXIMUM_ITERATIONS, Outcome.OUT_OF_TIME) and self._has_enough():
             outcome = Outcome.CONVERGED
         if Outcome.OUT_OF_TIME in ended:  # far off, the last loss takes all points for outliers, and is content
@@ -228,24 +231,38 @@ class _Search:
         local = self._local(self.options.losses[-1])
         return SolverResult.at(local, outcome, self.evaluations, tuple(self.trace))
 
-    def _is_shared(self, loss: Loss) -> bool:
-        """Whether noise that neighbours share may make the cloud more likely than what is believed of it costs."""
-        return gain_by_shared_noise(self._local(loss), self.whole) > 0.0
+    def _shared(self, loss: Loss) -> Floats | None:
+        """Where noise that neighbours share is sought: (5,); None where it makes the cloud no more likely."""
+        gain, size, length = gain_by_shared_noise(self._local(loss), self.whole)
+        if gain <= 0.0:
+            return None
+        found = self.whole.hyperprior.within(self._local(loss).eta)
+        found[[SHARED, LENGTH]] = size, length
+        return found
 
-    def _take_whole(self) -> None:
-        if self.problem is not self.whole:
-            self.problem, self._at = self.whole, None
-            coefficients = _sized(self.evaluation.coefficients, self.whole.size)
-            self.evaluation = replace(self.evaluation, coefficients=coefficients)
+    def _takes_whole(self, shared: Floats, loss: Loss) -> bool:
+        """Goes on with noise that neighbours share, unless what is sought there falls back to none."""
+        before = self.problem, self._at, self.evaluation, self.noise, self.own, self.eta
+        self.problem, self._at, self.starts = self.whole, None, [without_shared_noise(self.whole, self.noise, self.eta)]
+        none, most = self.starts[0][SHARED], shared[SHARED]
+        self.starts.append(shared)
+        self.evaluation = replace(self.evaluation, coefficients=self.whole.sized(self.evaluation.coefficients))
+        if self._local(loss).eta[SHARED] > 0.5 * (none + most):
+            return True
+        self.problem, self._at, self.evaluation, self.noise, self.own, self.eta = before
+        return False
+
+    def _without(self) -> Floats:
+        """Where hyperparameters are sought when none is known there: without noise that neighbours share."""
+        return without_shared_noise(self.problem, self.noise, self.eta)
 
     def _local(self, loss: Loss) -> LocalModel:
         """The model about the trial; what is known there already is not computed again."""
         at = self._at
         if at is None or at.evaluation is not self.evaluation or at.loss is not loss:
             jacobian = None if at is None or at.evaluation is not self.evaluation else at.jacobian
-            is_held = self.options.keeps_scales and self.before is not None and loss is not self.options.losses[-1]
-            known = [] if at is None or at.loss is not loss else [at.eta]
-            starts = known or starts_of(self.problem, self.noise, self.eta, self.before)
+            is_held = self.keeps_scales and loss is not self.options.losses[-1]
+            starts = self.starts if at is None or at.loss is not loss else [at.eta]
             at = LocalModel(
                 self.problem,
                 self.evaluation,
@@ -253,11 +270,11 @@ class _Search:
                 self.noise,
                 self.options.graduation,
                 jacobian,
-                starts,
+                starts or [self._without()],
                 self.own,
                 is_held=is_held,
             )
-            self._at, self.noise, self.own, self.eta = at, at.noise, at.own, at.eta
+            self._at, self.noise, self.own, self.eta, self.starts = at, at.noise, at.own, at.eta, []
         return at
 
     def _descend(self, loss: Loss, settled: float, most: int = 0) -> Outcome:
@@ -330,41 +347,23 @@ class _Search:
         return Outcome.REFUSED if unsolved else Outcome.NO_DESCENT
 
 
-def starts_of(problem: Problem, noise: float, eta: Floats | None = None, before: Floats | None = None) -> list[Floats]:
-    """From where hyperparameters are sought when nothing near is known: without and with noise that is shared.
+def without_shared_noise(problem: Problem, noise: float, eta: Floats | None = None) -> Floats:
+    """Logarithms of hyperparameters to begin with, (5,), without noise that neighbours share.
 
     Args:
         problem: what is registered.
         noise: standard deviation of a point's distance so far, metres.
         eta: logarithms of the hyperparameters so far; what is believed of them if not given.
-        before: those of the frame before, whose shared noise is tried too.
     """
     median = problem.hyperprior.median
-    without = median.copy() if eta is None else eta.copy()
-    without[NOISE] = np.log(noise)
-    if problem.shared is None:
-        return [without]
-    without[[SHARED, LENGTH]] = median[[SHARED, LENGTH]]
-    sizes = [(np.log(noise), median[LENGTH])]
-    if before is not None and before[SHARED] > median[SHARED]:
-        sizes.append((before[SHARED], before[LENGTH]))
-    found = [without]
-    for size, length in sizes:
-        found.append(without.copy())
-        found[-1][[SHARED, LENGTH]] = size, length
-    return found
-
-
-def _sized(coefficients: Floats, count: int) -> Floats:
-    """The first so many, and zeros behind them: what neighbours share comes last."""
-    found = np.zeros(count)
-    found[: len(coefficients)] = coefficients[:count]
+    found = median.copy() if eta is None else eta.copy()
+    found[NOISE], found[[SHARED, LENGTH]] = np.log(noise), median[[SHARED, LENGTH]]
     return found
 
 
 def _begun(problem: Problem, start: Floats, near: Evaluation | None) -> Evaluation:
     """The trial at the start: the one given, where it is of this cloud and has just these coefficients."""
-    sized = start if len(start) == problem.size else _sized(start, problem.size)
+    sized = problem.sized(start)
     if near is None or near.cloud is not problem.cloud:
         return problem.evaluation(sized, near, anew=True)
     if near.coefficients is not start:

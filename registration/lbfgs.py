@@ -12,11 +12,13 @@ from scipy.optimize import minimize
 from softtwin.reference.data.outcome import NotConverged
 
 from . import landmarks
-from .gauss_newton import IterationRecord, LocalModel, SolverResult, starts_of
+from .gauss_newton import IterationRecord, LocalModel, SolverResult, without_shared_noise
+from .hyperparameters import LENGTH, SHARED
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .penalties import Penalty
 from .problem import Evaluation, Problem
+from .score import gain_by_shared_noise
 
 Floats = NDArray[np.float64]
 _WALL = 10.0  # times the objective: what a coefficient costs at which the model finds no state
@@ -90,23 +92,34 @@ class _TimeIsOver(Exception):  # noqa: N818 - no error
 
 class _Run:
     def __init__(self, options: LBFGS, problem: Problem, start: Floats, near: Evaluation | None) -> None:
-        self.options, self.problem = options, problem
-        self.evaluation = self.best = problem.evaluation(start, near, anew=True)
+        self.options, self.whole, self.problem = options, problem, problem.unshared
+        self.evaluation = self.best = self.problem.evaluation(self.problem.sized(start), near, anew=True)
         self.evaluations, self.trace = 1, list[IterationRecord]()
         penalty = options.penalty
         self.cost = None if penalty is None else penalty.of(problem.observed.body, problem.forces)
 
     def found(self) -> SolverResult:
         noise = max(robust_deviation(self.evaluation.match.distances), self.problem.noise.minimum)
-        outcome = Outcome.CONVERGED
+        last, outcome = self.options.losses[-1], Outcome.CONVERGED
         for loss in self.options.losses:
-            local = LocalModel(self.problem, self.evaluation, loss, noise, starts=starts_of(self.problem, noise))
-            noise = local.noise
-            outcome = self._descend(loss, local)
-        local = LocalModel(
-            self.problem, self.evaluation, self.options.losses[-1], noise, starts=starts_of(self.problem, noise)
-        )
+            local = self._local(loss, noise)
+            noise, outcome = local.noise, self._descend(loss, local)
+        local = self._local(last, noise)
+        gain, size, length = gain_by_shared_noise(local, self.whole)
+        if gain > 0.0:
+            self.problem = self.whole
+            self.evaluation = self.best = replace(
+                self.evaluation, coefficients=self.whole.sized(self.evaluation.coefficients)
+            )
+            shared = self.whole.hyperprior.within(local.eta)
+            shared[[SHARED, LENGTH]] = size, length
+            outcome = self._descend(last, self._local(last, local.noise, shared))
+            local = self._local(last, local.noise, shared)
         return SolverResult.at(local, outcome, self.evaluations, tuple(self.trace))
+
+    def _local(self, loss: Loss, noise: float, *others: Floats) -> LocalModel:
+        starts = [without_shared_noise(self.problem, noise), *others]
+        return LocalModel(self.problem, self.evaluation, loss, noise, starts=starts)
 
     def _descend(self, loss: Loss, local: LocalModel) -> Outcome:
         """One run at fixed scales, in coefficients of unit prior variance."""

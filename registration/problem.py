@@ -137,6 +137,14 @@ class Problem:
         """The same without noise that neighbours share: its coefficients are the first of these."""
         return self if self.shared is None else replace(self, shared=None)
 
+    def sized(self, coefficients: Floats) -> Floats:
+        """Coefficients of the same with or without shared noise for this one, (k,): those of that noise come last."""
+        if len(coefficients) == self.size:
+            return coefficients
+        found = np.zeros(self.size)
+        found[: len(coefficients)] = coefficients[: self.size]
+        return found
+
     def normals(self, evaluation: Evaluation) -> Floats:
         """Of the surface at the points, (p, 3), on the cloud's axes."""
         directions = evaluation.match.directions

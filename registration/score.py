@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .problem import Problem
 
 Floats = NDArray[np.float64]
-_LENGTHS = 5  # of noise that neighbours share, from the least to the largest
+_LENGTHS, _SIZES = 5, 40  # of noise that neighbours share, from the least to the largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,34 +70,46 @@ def _pull(local: LocalModel, columns: Floats) -> tuple[Floats, Floats]:
     return pull, weighted.T @ weighted - across.T @ solved
 
 
-def gain_by_shared_noise(local: LocalModel, problem: Problem) -> float:
+def gain_by_shared_noise(local: LocalModel, problem: Problem) -> tuple[float, float, float]:
     """What noise that neighbours share may add to the logarithm of the evidence, beyond what is believed of it.
 
-    About none the logarithm is U t - I t^2 / 2 in the variance t of such noise, with U = (s' V s - tr(M V)) / 2 and
-    I = tr(M V M V) / 2, where s is the slope by the modes' coefficients, M its covariance, V the modes' variances for a
-    length: U^2 / (2 I) at most. Robust weights make s smaller than M tells, which is made good.
+    With s the slope by the modes' coefficients, M its covariance, V their variances for a length, and t the variance of
+    such noise, the evidence grows by the factor of logarithm (s' (V^-1 / t + M)^-1 s - log |1 + t M V|) / 2. That costs
+    an eigendecomposition, and is looked at where the parabola about t = 0 promises something: its slope is
+    U = (s' V s - tr(M V)) / 2, its bend I = tr(M V M V) / 2, its top U^2 / (2 I). Robust weights make s smaller than M
+    tells, which is made good. The other hyperparameters stay as they are.
 
     Args:
         local: the objective's model at the end of a registration without shared noise.
         problem: the same with it.
+
+    Returns:
+        The most of it, and the logarithms of size and length where that is, metres; minus infinity where none promises
+        anything.
     """
     modes, hyperprior = problem.shared, problem.hyperprior
+    best = (-np.inf, 0.0, 0.0)
     if modes is None:
-        return -np.inf
+        return best
     pull, covariance = _pull(local, problem.by_shared_noise(local.evaluation))
     weights, scaled = local.weights, local.problem.residuals(local.evaluation, local.own) / local.deviations
     shrunk = float(np.sum((weights * scaled) ** 2) / max(weights.sum(), 1e-300))
-    squares, products = pull**2 / max(shrunk, 1e-300), covariance**2
-    best = -np.inf
-    for length in np.linspace(hyperprior.lowest[LENGTH], hyperprior.highest[LENGTH], _LENGTHS):
-        variances = np.tile(np.exp(modes.spread(float(np.exp(length)))[0]), 3)
-        slope = 0.5 * float(variances @ (squares - np.diag(covariance)))
-        bend = 0.5 * float(variances @ products @ variances)
-        if slope <= 0.0:
+    pull = pull / np.sqrt(max(shrunk, 1e-300))
+    low, high, median = (float(values[SHARED]) for values in (hyperprior.lowest, hyperprior.highest, hyperprior.median))
+    sizes = np.linspace(max(low, median), high, _SIZES)
+    costs = 0.5 * ((sizes - median) / hyperprior.spread[SHARED]) ** 2
+    for length in np.linspace(hyperprior.lowest[LENGTH], hyperprior.highest[LENGTH], _LENGTHS).tolist():
+        root = np.tile(np.exp(0.5 * modes.spread(np.exp(length))[0]), 3)
+        slopes, matrix = root * pull, root[:, None] * covariance * root
+        slope, bend = 0.5 * float(slopes @ slopes - np.trace(matrix)), 0.5 * float(np.sum(matrix**2))
+        if slope <= 0.0 or 0.5 * slope**2 / bend < np.interp(0.5 * np.log(slope / bend), sizes, costs):
             continue
-        size = np.clip(0.5 * np.log(slope / bend), hyperprior.lowest[SHARED], hyperprior.highest[SHARED])
-        beside = (size - hyperprior.median[SHARED]) / hyperprior.spread[SHARED]
-        best = max(best, 0.5 * slope**2 / bend - 0.5 * float(beside**2))
+        values, vectors = np.linalg.eigh(matrix)
+        grown = np.exp(2.0 * sizes)[:, None] * np.maximum(values, 0.0)
+        squares = np.exp(2.0 * sizes)[:, None] * (vectors.T @ slopes) ** 2
+        gains = 0.5 * (squares / (1.0 + grown) - np.log1p(grown)).sum(axis=1) - costs
+        top = int(gains.argmax())
+        best = max(best, (float(gains[top]), float(sizes[top]), float(length)))
     return best
 
 
