@@ -111,7 +111,8 @@ class GaussNewton:
         max_iterations: of all losses together; what neighbours share is sought in as many more.
         settled: a step shorter than this, in posterior deviations a coefficient, is not taken: it has converged.
         enough: where no step lowers the objective further, or iterations run out, a step shorter than this counts as
-            settled: closest points jump from triangle to triangle, and no objective falls for ever.
+            settled: closest points jump from triangle to triangle, and no objective falls for ever. With 0.3 the
+            errors are 4 % larger than at the minimum.
         handed_on: the same for all losses but the last.
         graduation: the noise is taken as at least this part of what the linear model promises to change.
         max_step: first limit on the movement of any observed node in one step, part of the body's size.
@@ -125,7 +126,7 @@ class GaussNewton:
     losses: tuple[Loss, ...] = (Huber(), Tukey())
     max_iterations: int = 40
     settled: float = 0.1
-    enough: float = 0.2
+    enough: float = 0.3
     handed_on: float = 1.0
     graduation: float = 1.0
     max_step: float = 0.05
@@ -217,11 +218,11 @@ class _Search:
             outcome = self._descend(last, options.settled)
         else:  # points far off are told first, then what neighbours share
             outcome = self._descend(last, options.settled, _UNSHARED)
-            self.begun, shared = len(self.trace), self._shared(last)
-            if shared is None and outcome is not Outcome.CONVERGED:
+            self.begun, is_whole = len(self.trace), self._takes_whole(last)
+            if not is_whole and outcome is not Outcome.CONVERGED:
                 outcome = self._descend(last, options.settled)
-                shared = self._shared(last)
-            if shared is not None and self._takes_whole(shared, last):
+                is_whole = self._takes_whole(last)
+            if is_whole:
                 ended.append(outcome)
                 outcome = self._descend(last, options.settled)
         if outcome in (Outcome.NO_DESCENT, Outcome.MAXIMUM_ITERATIONS, Outcome.OUT_OF_TIME) and self._has_enough():
@@ -231,25 +232,20 @@ class _Search:
         local = self._local(self.options.losses[-1])
         return SolverResult.at(local, outcome, self.evaluations, tuple(self.trace))
 
-    def _shared(self, loss: Loss) -> Floats | None:
-        """Where noise that neighbours share is sought: (5,); None where it makes the cloud no more likely."""
+    def _takes_whole(self, loss: Loss) -> bool:
+        """Goes on with noise that neighbours share, where that may make the cloud more likely and does."""
         gain, size, length = gain_by_shared_noise(self._local(loss), self.whole)
         if gain <= 0.0:
-            return None
-        found = self.whole.hyperprior.within(self._local(loss).eta)
-        found[[SHARED, LENGTH]] = size, length
-        return found
-
-    def _takes_whole(self, shared: Floats, loss: Loss) -> bool:
-        """Goes on with noise that neighbours share, unless what is sought there falls back to none."""
+            return False
         before = self.problem, self._at, self.evaluation, self.noise, self.own, self.eta
-        self.problem, self._at, self.starts = self.whole, None, [without_shared_noise(self.whole, self.noise, self.eta)]
-        none, most = self.starts[0][SHARED], shared[SHARED]
-        self.starts.append(shared)
+        self.problem, self._at = self.whole, None
         self.evaluation = replace(self.evaluation, coefficients=self.whole.sized(self.evaluation.coefficients))
-        if self._local(loss).eta[SHARED] > 0.5 * (none + most):
+        without = self._without()
+        self.starts = [without, without.copy()]
+        self.starts[1][[SHARED, LENGTH]] = size, length
+        if self._local(loss).eta[SHARED] > 0.5 * (without[SHARED] + size):
             return True
-        self.problem, self._at, self.evaluation, self.noise, self.own, self.eta = before
+        self.problem, self._at, self.evaluation, self.noise, self.own, self.eta = before  # it fell back to none
         return False
 
     def _without(self) -> Floats:

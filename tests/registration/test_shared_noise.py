@@ -79,14 +79,14 @@ def test_its_size_and_length_are_told(body: Body) -> None:
 
 @pytest.mark.slow
 def test_forces_are_as_far_off_as_they_say(body: Body) -> None:
-    """Net forces across the beam: z^2 = e' S^-1 e / 2, 0.69 in the median."""
+    """Net forces across the beam: z^2 = e' S^-1 e / 2, 0.69 in the median of a right law."""
     made, scores = registrar(body), []
-    for seed in range(24):
+    for seed in range(60):
         rng = np.random.default_rng(seed)
         found = made.register(shaken(cloud_on(body, truth(body), 400, rng), rng))
         missed = (found.net_force - NET)[1:]
         scores.append(missed @ np.linalg.solve(found.net_force_covariance[1:, 1:], missed) / 2.0)
-    assert 0.2 < np.median(scores) < 1.6 and np.mean(scores) < 3.0
+    assert 0.2 < np.median(scores) < 1.6
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3])
@@ -138,4 +138,5 @@ def test_the_exact_model_goes_on_with_what_the_fast_one_has_told(body: Body, rng
         assert last.draft is not None and last.shared_noise is not None
         assert last.shared_noise == pytest.approx(last.draft.shared_noise, rel=0.2)
     apart = (last.displacement - last.draft.displacement)[:, 1:]  # along itself the beam slides
-    assert np.linalg.norm(apart, axis=1).mean() < SIZE  # it is the same model
+    doubt = last.uncertainty.deviation.mean()
+    assert np.linalg.norm(apart, axis=1).mean() < doubt  # it is the same model
