@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -230,6 +231,8 @@ class _Search:
         if Outcome.OUT_OF_TIME in ended:  # far off, the last loss takes all points for outliers, and is content
             outcome = Outcome.OUT_OF_TIME
         local = self._local(self.options.losses[-1])
+        if outcome is Outcome.CONVERGED and options.graduation > 0.0:
+            local = self._ended(local)
         return SolverResult.at(local, outcome, self.evaluations, tuple(self.trace))
 
     def _takes_whole(self, loss: Loss) -> bool:
@@ -296,6 +299,17 @@ class _Search:
             if is_handed_on and local.was_whole and abs(self.trace[-1].gain - 1.0) < _KEPT:
                 return Outcome.CONVERGED
         return Outcome.MAXIMUM_ITERATIONS
+
+    def _ended(self, local: LocalModel) -> LocalModel:
+        """After the last step, too: too short for new derivatives, and all the same a part of the doubt."""
+        coefficients = self.evaluation.coefficients + local.step(self.limit)
+        with suppress(NotConverged):
+            self.evaluations += 1
+            after = local.moved_to(self.problem.evaluation(coefficients, self.evaluation))
+            if after.value < local.value:
+                self.evaluation = after.evaluation
+                return after
+        return local
 
     def _has_enough(self) -> bool:
         local, enough = self._local(self.options.losses[-1]), self.options.enough
@@ -536,6 +550,18 @@ class LocalModel:
         residuals = self.problem.residuals(evaluation, self.own)
         gradient = self._gradient(residuals, self.loss.weight(residuals / self.deviations))
         return _length(self._whole_for(gradient), gradient)
+
+    def moved_to(self, evaluation: Evaluation) -> LocalModel:
+        """The same about a trial so near that derivatives, information and hyperparameters are the same there."""
+        other = copy.copy(self)
+        other.__dict__.pop("_whole", None)
+        residuals = self.problem.residuals(evaluation, self.own)
+        other.evaluation, other.weights = evaluation, self.loss.weight(residuals / self.deviations)
+        if not isinstance(self._known, float):
+            other._beside = self._beside + self._known @ (evaluation.coefficients - self.evaluation.coefficients)
+        other.gradient = other._gradient(residuals, other.weights)
+        other.value = other.objective(evaluation, self.loss)
+        return other
 
     def _damped(self, damping: float) -> Floats:
         values, vectors = self._eigen
