@@ -85,12 +85,14 @@ class Hyperprior:
         spread: standard deviations, (h,); 0 of one that is known.
         lowest: (h,).
         highest: (h,).
+        below: standard deviations below the medians, (h,).
     """
 
     median: Floats
     spread: Floats
     lowest: Floats
     highest: Floats
+    below: Floats
 
     @classmethod
     def of(cls, priors: Sequence[LogNormalPrior]) -> Hyperprior:
@@ -100,7 +102,8 @@ class Hyperprior:
             median, lowest, highest = np.log(np.array(rows)).T
         spread = np.array([each.spread for each in priors])
         reach = np.where(spread > 0.0, _REACH, np.inf)
-        return cls(median, spread, np.maximum(lowest, median - reach), np.minimum(highest, median + reach))
+        below = np.array([each.spread if each.spread_below is None else each.spread_below for each in priors])
+        return cls(median, spread, np.maximum(lowest, median - reach), np.minimum(highest, median + reach), below)
 
     def with_minimum(self, place: int, value: float) -> Hyperprior:
         """The same with a larger least value of one."""
@@ -125,8 +128,9 @@ class Hyperprior:
 
     def cost(self, eta: Floats) -> tuple[float, Floats]:
         """Minus the logarithm of the density, and its gradient."""
-        scaled = np.where(self.spread > 0.0, eta - self.median, 0.0) / np.where(self.spread > 0.0, self.spread, 1.0)
-        return 0.5 * float(scaled @ scaled), scaled / np.where(self.spread > 0.0, self.spread, 1.0)
+        spread = np.where(self.spread > 0.0, np.where(eta < self.median, self.below, self.spread), 1.0)
+        scaled = np.where(self.spread > 0.0, eta - self.median, 0.0) / spread
+        return 0.5 * float(scaled @ scaled), scaled / spread
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from softtwin.reference.data.outcome import NotConverged
 
 from . import landmarks
 from .evidence import Evidence, LinearProblem
-from .hyperparameters import LENGTH, NOISE, SHARED, Hyperparameters
+from .hyperparameters import DISCREPANCY, LENGTH, NOISE, SHARED, Hyperparameters
 from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .posterior import Posterior
@@ -433,13 +433,11 @@ class LocalModel:
             self.eta, self.is_graduated = self._found(graduation, list(starts) or [start])
         self.scales = Hyperparameters(*np.exp(self.eta))
         self.noise = self.scales.noise
-        self.deviations = np.hypot(self.noise, self.rough)
+        self.deviations = np.hypot(self.noise, self.scales.discrepancy * self.rough)
         residuals = problem.residuals(evaluation, self.own)
         self.weights = loss.weight(residuals / self.deviations)
         self.precision = np.exp(-problem.prior_variances(self.eta)[0])
-        trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
-        self._informed = trusted.T @ trusted + self._known
-        self._hessian = self._informed + np.diag(self.precision)
+        self._inform()
         self.gradient = self._gradient(residuals, self.weights)
         self.value = self.objective(evaluation, loss)
 
@@ -458,7 +456,7 @@ class LocalModel:
         """
         problem, coefficients, groups = self.problem, self.evaluation.coefficients, self._groups
         residuals = problem.residuals(self.evaluation, self.own)
-        weights = self.loss.weight(residuals / np.hypot(noise, self.rough))
+        weights = self.loss.weight(residuals / np.hypot(noise, np.exp(eta[DISCREPANCY]) * self.rough))
         data = self.jacobian @ coefficients - residuals
         root = np.sqrt(weights)
         parts = [root[group, None] * self.jacobian[group] for group in groups]
@@ -552,16 +550,24 @@ class LocalModel:
         return _length(self._whole_for(gradient), gradient)
 
     def moved_to(self, evaluation: Evaluation) -> LocalModel:
-        """The same about a trial so near that derivatives, information and hyperparameters are the same there."""
+        """The same about a trial so near that derivatives and hyperparameters are the same there."""
         other = copy.copy(self)
-        other.__dict__.pop("_whole", None)
+        for name in ("_whole", "_scaled_hessian", "_factor", "_eigen"):
+            other.__dict__.pop(name, None)
         residuals = self.problem.residuals(evaluation, self.own)
         other.evaluation, other.weights = evaluation, self.loss.weight(residuals / self.deviations)
+        other._inform()
         if not isinstance(self._known, float):
             other._beside = self._beside + self._known @ (evaluation.coefficients - self.evaluation.coefficients)
         other.gradient = other._gradient(residuals, other.weights)
         other.value = other.objective(evaluation, self.loss)
         return other
+
+    def _inform(self) -> None:
+        """What the points tell by their weights, and what is known with what was believed."""
+        trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
+        self._informed = trusted.T @ trusted + self._known
+        self._hessian = self._informed + np.diag(self.precision)
 
     def _damped(self, damping: float) -> Floats:
         values, vectors = self._eigen
@@ -592,7 +598,26 @@ class LocalModel:
         shares = np.einsum("ij,ji->i", covariance, self._informed)
         informed = float(shares[: self.problem.error_part.stop].sum())
         moved, spread = self._by_hyperparameters(covariance)
-        return Posterior(self.evaluation.coefficients, covariance + moved @ spread @ moved.T, self.scales, informed)
+        covariance = self._unseen(covariance) + moved @ spread @ moved.T
+        return Posterior(self.evaluation.coefficients, covariance, self.scales, informed)
+
+    def _unseen(self, covariance: Floats) -> Floats:
+        """Of this estimate where the model errs as much as it was seen to: a cloud that tells less shows a part of it.
+
+        The estimate S (J' W D^-1 y) errs by S (P V P + J' W D^-1 D' D^-1 J) S with the larger variances V and D' of
+        the model's error in place of those that it was made with, 1 / P and D: S itself where they are the same.
+
+        Args:
+            covariance: S, (k, k).
+        """
+        if self.problem.error is None or self.scales.discrepancy >= 1.0:
+            return covariance
+        whole = self.eta.copy()
+        whole[DISCREPANCY] = 0.0
+        held = self.precision**2 * np.exp(self.problem.prior_variances(whole)[0])
+        root = np.sqrt(self.weights) * np.hypot(self.noise, self.rough) / self.deviations**2
+        trusted = root[:, None] * self.jacobian
+        return covariance @ (np.diag(held) + trusted.T @ trusted + self._known) @ covariance
 
     def _by_hyperparameters(self, covariance: Floats) -> tuple[Floats, Floats]:
         """Derivative of the mean by the logarithms of the hyperparameters, (k, h), and their covariance, (h, h)."""
@@ -601,7 +626,9 @@ class LocalModel:
         columns = (slopes * held).T
         residuals = self.problem.residuals(self.evaluation, self.own)
         share = (self.noise / self.deviations) ** 2  # of a distance's variance that is its own noise
-        columns[:, NOISE] = 2.0 * (share * self.weights * residuals / self.deviations**2) @ self.jacobian
+        weighted = self.weights * residuals / self.deviations**2
+        columns[:, NOISE] = 2.0 * (share * weighted) @ self.jacobian
+        columns[:, DISCREPANCY] += 2.0 * ((1.0 - share) * weighted) @ self.jacobian
         return covariance @ columns, self._evidence.covariance(self.eta)
 
 

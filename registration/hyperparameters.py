@@ -23,18 +23,22 @@ class LogNormalPrior:
         spread: standard deviation of its logarithm; 0 for a scale that is known.
         minimum: no smaller value is believed.
         maximum: no larger value is believed.
+        spread_below: standard deviation of its logarithm below the median; the same as above if not given.
     """
 
     median: float
     spread: float
     minimum: float = 0.0
     maximum: float = np.inf
+    spread_below: float | None = None
 
     def __post_init__(self) -> None:
         if not (0.0 < self.median < np.inf and 0.0 <= self.spread < np.inf and 0.0 <= self.minimum < np.inf):
             raise ValueError(
                 f"LogNormalPrior: expected a positive median, a spread and a least value of 0 or more, got {self}."
             )
+        if self.spread_below is not None and not 0.0 < self.spread_below < np.inf:
+            raise ValueError(f"LogNormalPrior.spread_below: expected a positive number, got {self.spread_below}.")
         if not self.maximum > 0.0:
             raise ValueError(f"LogNormalPrior.maximum: expected a positive number, got {self.maximum}.")
 

@@ -61,6 +61,12 @@ class Policy:
         "standard deviation of the logarithm of what the model gets wrong over what it was seen to",
         "foreign_patches, raised by 10 mm: with 0.5 three of twelve frames take the patch for the model's error",
     )
+    discrepancy_spread_below: float = choice(
+        1.0,
+        "",
+        "the same where it gets less wrong: a state near those that it knows well",
+        "misspecified, ensemble, ratio 0.45 to 0.49: with 0.25 the error is 0.25 in place of 0.22 mm",
+    )
     discrepancy_minimum: float = choice(
         0.3,
         "times what was seen",

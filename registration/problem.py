@@ -226,7 +226,11 @@ class Problem:
             priors[LENGTH] = LogNormalPrior(median, POLICY.shared_length_spread, least, longest)
         if self.error is not None:
             priors[DISCREPANCY] = LogNormalPrior(
-                1.0, POLICY.discrepancy_spread, POLICY.discrepancy_minimum, POLICY.discrepancy_maximum
+                1.0,
+                POLICY.discrepancy_spread,
+                POLICY.discrepancy_minimum,
+                POLICY.discrepancy_maximum,
+                POLICY.discrepancy_spread_below,
             )
         return Hyperprior.of(priors)
 
@@ -238,9 +242,9 @@ class Problem:
         """
 
         def found(eta: Floats) -> tuple[Floats, Floats]:
-            own, beside = np.exp(2.0 * eta[NOISE]), rough**2
+            own, beside = np.exp(2.0 * eta[NOISE]), np.exp(2.0 * eta[DISCREPANCY]) * rough**2
             slopes = np.zeros((len(eta), len(rough)))
-            slopes[NOISE] = 2.0 * own / (own + beside)
+            slopes[NOISE], slopes[DISCREPANCY] = 2.0 * own / (own + beside), 2.0 * beside / (own + beside)
             return np.log(own + beside), slopes
 
         return found
@@ -250,8 +254,9 @@ class Problem:
         logs, slopes = np.zeros(self.size), np.zeros((len(eta), self.size))
         logs[self.force_part], slopes[FORCE, self.force_part] = 2.0 * eta[FORCE], 2.0
         if self.error is not None:
-            logs[self.error_part], slopes[DISCREPANCY, self.error_part] = 2.0 * eta[DISCREPANCY], 2.0
-            logs[self.rest_part] = self.error.rest_logs
+            logs[self.error_part], logs[self.rest_part] = 2.0 * eta[DISCREPANCY], 2.0 * eta[DISCREPANCY]
+            logs[self.rest_part] += self.error.rest_logs
+            slopes[DISCREPANCY, self.error_part], slopes[DISCREPANCY, self.rest_part] = 2.0, 2.0
         if self.shared is not None:
             spread, by_length = self.shared.spread(float(np.exp(eta[LENGTH])))
             logs[self.noise_part] = 2.0 * eta[SHARED] + np.tile(spread, 3)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import embed
 from softtwin.meshes.shapes import beam
-from softtwin.registration.gauss_newton import GaussNewton
+from softtwin.registration.gauss_newton import GaussNewton, LocalModel
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.loss import Square
 from softtwin.registration.options import RegistrationOptions, SparseLocalisation
@@ -65,9 +65,11 @@ def options(distance: str = "surface") -> RegistrationOptions:
 
 
 def independent(found: Registration) -> Registration:
-    """The same with the posterior of points that err each by itself."""
-    assert found.local is not None
-    return replace(found, posterior=found.local.posterior())
+    """The same with the posterior of the derivatives at its own state, not at the one a last short step before."""
+    local = found.local
+    assert local is not None
+    there = LocalModel(found.problem, found.evaluation, Square(), local.noise, starts=[local.eta], own=local.own)
+    return replace(found, posterior=there.posterior(), local=there)
 
 
 @pytest.mark.parametrize("force", [1e-3, 5e-3, 1e-1])

@@ -108,8 +108,9 @@ def test_what_cannot_move_is_certain(body: Body, rng: np.random.Generator) -> No
 def test_more_points_and_less_noise_make_it_surer(body: Body) -> None:
     made = registrar(body)
     truth = made.model.solve(made.forces.forces(np.full(made.forces.size, 0.5 * FORCE))).displacement
+    seeds = [np.random.default_rng(seed) for seed in range(6)]  # one frame's hangs on how far the beam has bent
     sizes = [
-        made.register(cloud_on(body, truth, count, np.random.default_rng(1), NOISE)).uncertainty.deviation.mean()
+        np.mean([made.register(cloud_on(body, truth, count, rng, NOISE)).uncertainty.deviation.mean() for rng in seeds])
         for count in (50, 800)
     ]
     assert sizes[1] < 0.7 * sizes[0]  # what no point tells stays as it was believed
