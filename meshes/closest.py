@@ -103,7 +103,7 @@ class ClosestPoints:
         return len(self.triangles) <= _FEW
 
     def near(self, positions: Floats, cloud: Floats) -> tuple[Ints, Floats]:
-        """The same of a large surface by walking from the nearest vertex: a local minimum of the distance, found faster.
+        """The same, on a large surface by walking from the nearest vertex: a local minimum of the distance.
 
         Args:
             positions: where the vertices are now, (n, 3), metres.

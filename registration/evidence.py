@@ -56,7 +56,7 @@ class LinearProblem:
 
     @cached_property
     def upper(self) -> Floats:
-        """B' W B of each group so that its product with a symmetric matrix reads that one's upper triangle, (g, k k)."""
+        """B' W B of each group, (g, k k), for products with a symmetric matrix of which the upper triangle is known."""
         count = self.projection.shape[1]
         doubled = 2.0 * np.triu(np.ones((count, count))) - np.eye(count)
         return (self.information * doubled).reshape(len(self.information), -1)

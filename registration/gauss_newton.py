@@ -525,6 +525,11 @@ class LocalModel:
         return np.asarray(root * (vectors @ (vectors.T @ (root * right) / np.maximum(values, 1.0)[:, None])))
 
     @cached_property
+    def _inverse(self) -> Floats:
+        """Of the Hessian."""
+        return self.solved(np.eye(self.problem.size))
+
+    @cached_property
     def _whole(self) -> Floats:
         """The whole step."""
         return self._whole_for(self.gradient)
@@ -552,7 +557,7 @@ class LocalModel:
     def moved_to(self, evaluation: Evaluation) -> LocalModel:
         """The same about a trial so near that derivatives and hyperparameters are the same there."""
         other = copy.copy(self)
-        for name in ("_whole", "_scaled_hessian", "_factor", "_eigen"):
+        for name in ("_whole", "_scaled_hessian", "_factor", "_eigen", "_inverse"):
             other.__dict__.pop(name, None)
         residuals = self.problem.residuals(evaluation, self.own)
         other.evaluation, other.weights = evaluation, self.loss.weight(residuals / self.deviations)
@@ -594,22 +599,20 @@ class LocalModel:
 
     def posterior(self) -> Posterior:
         """Laplace's approximation at the trial, with what the doubt of the hyperparameters moves."""
-        covariance = self.solved(np.eye(self.problem.size))
+        covariance = self._inverse
         shares = np.einsum("ij,ji->i", covariance, self._informed)
         informed = float(shares[: self.problem.error_part.stop].sum())
         moved, spread = self._by_hyperparameters(covariance)
-        covariance = self._unseen(covariance) + moved @ spread @ moved.T
+        covariance = self.error_covariance() + moved @ spread @ moved.T
         return Posterior(self.evaluation.coefficients, covariance, self.scales, informed)
 
-    def _unseen(self, covariance: Floats) -> Floats:
-        """Of this estimate where the model errs as much as it was seen to: a cloud that tells less shows a part of it.
+    def error_covariance(self) -> Floats:
+        """Of this estimate, (k, k), where the model errs as much as it was seen to, though the cloud tells less.
 
         The estimate S (J' W D^-1 y) errs by S (P V P + J' W D^-1 D' D^-1 J) S with the larger variances V and D' of
         the model's error in place of those that it was made with, 1 / P and D: S itself where they are the same.
-
-        Args:
-            covariance: S, (k, k).
         """
+        covariance = self._inverse
         if self.problem.error is None or self.scales.discrepancy >= 1.0:
             return covariance
         whole = self.eta.copy()

@@ -141,7 +141,21 @@ def test_unknowns_of_no_size_are_none(rng: np.random.Generator) -> None:
     assert np.isfinite(value) and np.isfinite(gradient).all()
 
 
+def test_a_scale_may_be_freer_below_its_median(rng: np.random.Generator) -> None:
+    evidence = Drawn(rng, np.log([0.3, 2.0, 0.2])).evidence
+    free = replace(NOISES[1], spread=0.25, spread_below=1.0)
+    held = replace(evidence, hyperprior=Hyperprior.of([NOISES[0], free, NOISES[2]]))
+    for factor, spread in ((2.0, 0.25), (0.5, 1.0)):
+        eta, step = np.log([0.5, factor, 0.1]), 1e-5 * np.eye(3)[1]
+        cost, gradient = held.hyperprior.cost(eta)
+        assert cost == pytest.approx(0.5 * (np.log(factor) / spread) ** 2)
+        slope = (held.hyperprior.cost(eta + step)[0] - held.hyperprior.cost(eta - step)[0]) / 2e-5
+        assert gradient[1] == pytest.approx(slope, rel=1e-6)
+
+
 def test_priors_say_what_is_wrong() -> None:
+    with pytest.raises(ValueError, match="spread_below: expected a positive number, got 0"):
+        LogNormalPrior(1.0, 1.0, spread_below=0.0)
     with pytest.raises(ValueError, match="positive median"):
         LogNormalPrior(0.0, 1.0)
     with pytest.raises(ValueError, match="maximum: expected a positive number, got 0"):

@@ -9,7 +9,9 @@ import pytest
 
 from softtwin.meshes.body import Body
 from softtwin.registration.forward import reduce_model
-from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.gauss_newton import LocalModel
+from softtwin.registration.hyperparameters import DISCREPANCY, LogNormalPrior
+from softtwin.registration.loss import Square
 from softtwin.registration.options import options_for
 from softtwin.registration.pose import Pose
 from softtwin.registration.priors import ModelError, PosePrior, nodal_forces
@@ -179,3 +181,32 @@ def test_the_derivative_of_the_distances_is_exact(body: Body, rng) -> None:
     assert np.abs(jacobian[:, problem.rest_part]).max() > 0.0
     cotangent = rng.standard_normal(len(cloud))
     np.testing.assert_allclose(problem.vjp(evaluation, cotangent), jacobian.T @ cotangent, rtol=1e-8, atol=1e-10)
+
+
+def test_margins_are_those_of_an_estimate_that_believed_the_model_too_much(
+    body: Body, rng: np.random.Generator
+) -> None:
+    """Drawn: unknowns and distances with the model's error as it was seen, an estimate made with 0.4 of it."""
+    model, observed = Biased(body), SurfaceDistance(body, body.surfaces["observed"])
+    forces = nodal_forces(body, body.node_sets["tip"][:2], LogNormalPrior(0.05, 0.0))
+    error = replace(ModelError.of(model.discrepancy, observed), size=0.1)
+    cloud = cloud_on(body, true_displacement(body, np.zeros(2)), 100, rng, 1e-3)
+    reduced = reduce_model(model, observed.nodes, forces.basis)
+    problem = Problem(reduced, observed, forces, None, cloud, LogNormalPrior(1e-4, 0.0), error)
+    start = problem.hyperprior.median.copy()
+    start[DISCREPANCY] = np.log(0.4)
+    evaluation = problem.evaluation(np.zeros(problem.size))
+    local = LocalModel(problem, evaluation, Square(), 1e-4, starts=[start], is_held=True)
+    assert local.scales.discrepancy == pytest.approx(0.4)
+
+    believed = problem.hyperprior.median
+    variances = np.exp(problem.prior_variances(believed)[0])
+    unknown = np.sqrt(variances)[:, None] * rng.standard_normal((problem.size, 40_000))
+    noise = np.hypot(local.noise, local.rough)[:, None] * rng.standard_normal((len(cloud), 40_000))
+    data = (local.jacobian @ unknown + noise) / local.deviations[:, None] ** 2
+    off = local.solved(local.jacobian.T @ data) - unknown
+    wanted = np.cov(off)
+    found = local.error_covariance()
+    np.testing.assert_allclose(found, wanted, atol=0.04 * np.sqrt(np.outer(np.diag(wanted), np.diag(wanted))).max())
+    assert (np.diag(found) > 0.999 * np.diag(local.solved(np.eye(problem.size)))).all()
+    assert np.diag(found)[problem.rest_part].sum() > 2.0 * 0.4**2 * variances[problem.rest_part].sum()

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from softtwin.meshes.body import Body
-from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.gauss_newton import GaussNewton, LocalModel
+from softtwin.registration.hyperparameters import SHARED, LogNormalPrior
+from softtwin.registration.loss import Square
 from softtwin.registration.priors import nodal_forces
+from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals import SurfaceDistance
-from softtwin.registration.score import by_rigid_motion, by_scale, score
+from softtwin.registration.score import by_rigid_motion, by_scale, gain_by_shared_noise, score
 from softtwin.registration.verdict import Code, Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -100,3 +105,43 @@ def test_columns_are_derivatives_of_the_distances(registrar: Registrar) -> None:
 def test_nothing_is_said_of_what_is_not_seen(registrar: Registrar) -> None:
     local = registrar.register(some_cloud(registrar, 3)).local
     assert local is not None and score(local, np.zeros((400, 1))) is None
+
+
+def evidence_with(local: LocalModel, problem: Problem, size: float, length: float) -> float:
+    """Logarithm of the dense normal law of the distances with noise of a size and length that neighbours share."""
+    data = local.jacobian @ local.evaluation.coefficients - local.problem.residuals(local.evaluation, local.own)
+    covariance = np.diag(local.deviations**2) + local.jacobian / local.precision @ local.jacobian.T
+    assert problem.shared is not None
+    modes = problem.by_shared_noise(local.evaluation)
+    covariance += size**2 * modes * np.exp(np.tile(problem.shared.spread(length)[0], 3)) @ modes.T
+    return -0.5 * float(np.linalg.slogdet(covariance)[1] + data @ np.linalg.solve(covariance, data))
+
+
+def least_squares(registrar: Registrar, cloud: np.ndarray) -> tuple[LocalModel, Problem]:
+    """Where a registration without shared noise ends, and the problem with it."""
+    options = replace(registrar.options, solver=GaussNewton(losses=(Square(),)), correlated=False)
+    found = Registrar(registrar.model, registrar.observed, registrar.forces, options).register(cloud)
+    assert found.local is not None
+    return found.local, replace(found.problem, shared=registrar.observed.modes)
+
+
+def test_what_shared_noise_may_explain_is_known_before_it_is_sought(registrar: Registrar) -> None:
+    cloud, size = some_cloud(registrar, 0), 3e-3
+    waves = 10.0 * np.pi * np.random.default_rng(3).standard_normal((3, 3))
+    local, whole = least_squares(registrar, cloud + size * np.sin(cloud @ waves))
+    gain, log_size, log_length = gain_by_shared_noise(local, whole)
+    prior = whole.hyperprior
+    cost = 0.5 * ((log_size - prior.median[SHARED]) / prior.spread[SHARED]) ** 2
+    none, some = (evidence_with(local, whole, part, np.exp(log_length)) for part in (0.0, np.exp(log_size)))
+    assert gain > 10.0 and some - none - cost == pytest.approx(gain, rel=0.1)  # squares count as if their mean were 1
+    assert 0.3 * size < np.exp(log_size) < 3.0 * size
+
+
+def test_noise_of_its_own_is_seldom_thought_to_be_shared(registrar: Registrar) -> None:
+    gains = [gain_by_shared_noise(*least_squares(registrar, some_cloud(registrar, seed)))[0] for seed in range(20)]
+    assert np.mean(np.greater(gains, 0.0)) <= 0.2
+
+
+def test_a_problem_without_shared_noise_gains_nothing(registrar: Registrar) -> None:
+    found = registrar.register(some_cloud(registrar, 1))
+    assert gain_by_shared_noise(found.local, found.problem.unshared)[0] == -np.inf
