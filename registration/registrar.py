@@ -162,8 +162,12 @@ class Registrar:
         is_missed = match.rms * np.sqrt(inflation_factor) > _MISSED * self.noise.minimum
         if not is_missed or self._is_late:
             return found
+        try:
+            anywhere = self.anywhere()
+        except ValueError:  # a network has learned no forces there
+            return found
         with suppress(NotConverged):
-            other = self.anywhere().limited(self.options.solver.until).with_landmarks(self.landmarks).register(cloud)
+            other = anywhere.limited(self.options.solver.until).with_landmarks(self.landmarks).register(cloud)
             if other.judgement.is_usable:
                 return found.with_check(_elsewhere(match.rms, other.evaluation.match.rms))
         return found
@@ -504,7 +508,9 @@ def prepare(
     """
     options = options or RegistrationOptions()
     observed = SurfaceDistance(model.body, triangles, options.distance)
-    scale = LogNormalPrior(force_scale, POLICY.force_spread, minimum=1e-2 * force_scale)
+    is_anywhere = options.localisation.rounds > 0 and model.error > 0.0
+    spread = POLICY.force_spread_anywhere if is_anywhere else POLICY.force_spread
+    scale = LogNormalPrior(force_scale, spread, minimum=1e-2 * force_scale)
     if nodes is None:
         if parameter_blocks is None and pose is None:
             raise ValueError("prepare.nodes: expected nodes that may carry force where nothing else is unknown.")
