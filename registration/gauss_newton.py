@@ -110,7 +110,7 @@ class GaussNewton:
     Args:
         losses: one after the other.
         max_iterations: of all losses together; what neighbours share is sought in as many more.
-        settled: a step shorter than this, in posterior deviations a coefficient, is not taken: it has converged.
+        settled: a step shorter than this, in posterior deviations a coefficient, is the last: it has converged.
         enough: where no step lowers the objective further, or iterations run out, a step shorter than this counts as
             settled: closest points jump from triangle to triangle, and no objective falls for ever. With 0.3 the
             errors are 4 % larger than at the minimum.
@@ -126,7 +126,7 @@ class GaussNewton:
 
     losses: tuple[Loss, ...] = (Huber(), Tukey())
     max_iterations: int = 40
-    settled: float = 0.1
+    settled: float = 0.2
     enough: float = 0.3
     handed_on: float = 1.0
     graduation: float = 1.0
