@@ -86,7 +86,7 @@ def test_forces_are_as_far_off_as_they_say(body: Body) -> None:
         found = made.register(shaken(cloud_on(body, truth(body), 400, rng), rng))
         missed = (found.net_force - NET)[1:]
         scores.append(missed @ np.linalg.solve(found.net_force_covariance[1:, 1:], missed) / 2.0)
-    assert 0.2 < np.median(scores) < 1.6
+    assert 0.2 < np.median(scores) < 1.6 and np.mean(scores) < 3.0
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3])
@@ -138,5 +138,4 @@ def test_the_exact_model_goes_on_with_what_the_fast_one_has_told(body: Body, rng
         assert last.draft is not None and last.shared_noise is not None
         assert last.shared_noise == pytest.approx(last.draft.shared_noise, rel=0.2)
     apart = (last.displacement - last.draft.displacement)[:, 1:]  # along itself the beam slides
-    doubt = last.uncertainty.deviation.mean()
-    assert np.linalg.norm(apart, axis=1).mean() < doubt  # it is the same model
+    assert np.linalg.norm(apart, axis=1).mean() < SIZE  # it is the same model
