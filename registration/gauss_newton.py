@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import copy
 import time
-from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from softtwin.reference.data.outcome import NotConverged
 
-from . import landmarks
-from .evidence import Evidence, LinearProblem
-from .hyperparameters import DISCREPANCY, LENGTH, NOISE, SHARED, Hyperparameters
+from .hyperparameters import LENGTH, SHARED
+from .local_model import LocalModel, without_shared_noise
 from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .posterior import Posterior
@@ -30,7 +25,6 @@ _UNSHARED = 8  # iterations in which points far off are told, before noise that 
 _KEPT = 0.2  # a whole step that misses its promise by less: where only a start is wanted, it was the last
 _TRUSTED = 3.0  # deviations
 _NEARER = 1e-3  # part of the objective that closest points searched anew must take away to go on
-_GROUPS = 6  # of points, by how far the model's error makes them doubtful
 _UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
 
 
@@ -357,20 +351,6 @@ class _Search:
         return Outcome.REFUSED if unsolved else Outcome.NO_DESCENT
 
 
-def without_shared_noise(problem: Problem, noise: float, eta: Floats | None = None) -> Floats:
-    """Logarithms of hyperparameters to begin with, (5,), without noise that neighbours share.
-
-    Args:
-        problem: what is registered.
-        noise: standard deviation of a point's distance so far, metres.
-        eta: logarithms of the hyperparameters so far; what is believed of them if not given.
-    """
-    median = problem.hyperprior.median
-    found = median.copy() if eta is None else eta.copy()
-    found[NOISE], found[[SHARED, LENGTH]] = np.log(noise), median[[SHARED, LENGTH]]
-    return found
-
-
 def _begun(problem: Problem, start: Floats, near: Evaluation | None) -> Evaluation:
     """The trial at the start: the one given, where it is of this cloud and has just these coefficients."""
     sized = problem.sized(start)
@@ -387,287 +367,3 @@ def _next_limit(limit: float, taken: float, gain: float) -> float:
     if gain < 0.3:
         return limit / 2.0
     return max(limit, 2.0 * taken) if gain > 0.7 else limit
-
-
-class LocalModel:
-    """The Gauss-Newton model of the objective about a trial, at the hyperparameters found there.
-
-    Args:
-        problem: what is registered.
-        evaluation: where.
-        loss: of the points.
-        noise: their scale so far, metres, for the weights that the hyperparameters are found with.
-        graduation: the noise is taken as at least this part of what the linear model promises to change.
-        jacobian: of the distances at the trial, (p, k), where it is known.
-        starts: logarithms of hyperparameters that the search for them begins with; those that are believed if none.
-        own: the points' own noise so far, metres, without what is yet to be explained; None for all of it.
-        is_held: the hyperparameters are the first of the starts, and not sought.
-    """
-
-    def __init__(
-        self,
-        problem: Problem,
-        evaluation: Evaluation,
-        loss: Loss,
-        noise: float,
-        graduation: float = 0.0,
-        jacobian: Floats | None = None,
-        starts: Sequence[Floats] = (),
-        own: float | None = None,
-        *,
-        is_held: bool = False,
-    ) -> None:
-        self.problem, self.evaluation, self.loss = problem, evaluation, loss
-        self.was_whole, self.own = True, noise if own is None else own
-        self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
-        off, leaning = problem.landmark_residuals(evaluation), problem.normal_residuals(evaluation)
-        by_marks, pull_by_marks = _told(off, landmarks.LOSS, lambda: problem.landmark_jacobian(evaluation))
-        by_normals, pull_by_normals = _told(leaning, loss, lambda: problem.normal_jacobian(evaluation))
-        self._known, self._beside = by_marks + by_normals, pull_by_marks + pull_by_normals
-        self._groups, self.rough = _grouped(problem.rough(evaluation))
-        start = problem.hyperprior.within(starts[0]) if len(starts) else _believed(problem, noise)
-        self._evidence = self._evidence_near(start, noise)
-        if is_held:
-            self.eta, self.is_graduated = start, False
-        else:
-            self.eta, self.is_graduated = self._found(graduation, list(starts) or [start])
-        self.scales = Hyperparameters(*np.exp(self.eta))
-        self.noise = self.scales.noise
-        self.deviations = np.hypot(self.noise, self.scales.discrepancy * self.rough)
-        residuals = problem.residuals(evaluation, self.own)
-        self.weights = loss.weight(residuals / self.deviations)
-        self.precision = np.exp(-problem.prior_variances(self.eta)[0])
-        self._inform()
-        self.gradient = self._gradient(residuals, self.weights)
-        self.value = self.objective(evaluation, loss)
-
-    def _gradient(self, residuals: Floats, weights: Floats) -> Floats:
-        by_distances = weights * residuals / self.deviations**2
-        return by_distances @ self.jacobian + self.precision * self.evaluation.coefficients + self._beside
-
-    def _evidence_near(self, eta: Floats, noise: float) -> Evidence:
-        """Of the hyperparameters, with the weights that the points have at some noise.
-
-        Weights cut tails off: what a normal law has there is added to the squares of what the linear model leaves.
-
-        Args:
-            eta: logarithms of hyperparameters near those sought, (5,).
-            noise: standard deviation of a point's distance, metres.
-        """
-        problem, coefficients, groups = self.problem, self.evaluation.coefficients, self._groups
-        residuals = problem.residuals(self.evaluation, self.own)
-        weights = self.loss.weight(residuals / np.hypot(noise, np.exp(eta[DISCREPANCY]) * self.rough))
-        data = self.jacobian @ coefficients - residuals
-        root = np.sqrt(weights)
-        parts = [root[group, None] * self.jacobian[group] for group in groups]
-        known = None if isinstance(self._known, float) else (self._known, self._known @ coefficients - self._beside)
-        linear = LinearProblem(
-            np.stack([part.T @ part for part in parts]),
-            np.stack([(root[group] * data[group]) @ part for group, part in zip(groups, parts, strict=True)]),
-            np.array([data[group] @ (weights[group] * data[group]) for group in groups]),
-            np.array([weights[group].sum() for group in groups]),
-            np.zeros(len(groups)),
-            known,
-        )
-        there = np.array([self.rough[group[0]] for group in groups])
-        found = Evidence(linear, problem.noise_variances(there), problem.prior_variances, problem.hyperprior)
-        left = weights * (data - self.jacobian @ found.mean(eta)) ** 2
-        beyond = 1.0 / self.loss.consistency - 1.0
-        return replace(found, problem=replace(linear, tail=np.array([beyond * left[group].sum() for group in groups])))
-
-    def _found(self, graduation: float, starts: list[Floats]) -> tuple[Floats, bool]:
-        """Logarithms of the hyperparameters, and whether the noise is held above what the model would believe."""
-        evidence = self._evidence
-        eta = evidence.maximum(starts)
-        self.own = float(np.exp(eta[NOISE]))
-        minimum = np.log(max(graduation * self._promised(evidence, eta), 1e-300))
-        if minimum <= eta[NOISE]:
-            return eta, False
-        held = replace(evidence, hyperprior=evidence.hyperprior.with_minimum(NOISE, minimum))
-        return held.maximum([eta]), True
-
-    def _promised(self, evidence: Evidence, eta: Floats) -> float:
-        """Root mean square change of the residuals by the best step at some hyperparameters, metres."""
-        linear, step = evidence.problem, evidence.mean(eta) - self.evaluation.coefficients
-        square = float(np.einsum("gij,i,j->", linear.information, step, step, optimize=True))
-        return float(np.sqrt(max(square, 0.0) / max(linear.count.sum(), 1.0)))
-
-    @cached_property
-    def _scaled_hessian(self) -> Floats:
-        """In coefficients of unit prior variance: forces in newtons and poses differ by orders of size."""
-        root = 1.0 / np.sqrt(self.precision)
-        return root[:, None] * self._hessian * root
-
-    @cached_property
-    def _eigen(self) -> tuple[Floats, Floats]:
-        """For steps that have to be damped."""
-        values, vectors = np.linalg.eigh(self._scaled_hessian)
-        return values, vectors
-
-    @cached_property
-    def _factor(self) -> tuple[Floats, bool] | None:
-        """Cholesky's factor; None where information and prior are too far apart for it."""
-        with suppress(np.linalg.LinAlgError):
-            factor: tuple[Floats, bool] = cho_factor(self._scaled_hessian, check_finite=False)
-            return factor
-        return None
-
-    def _whole_for(self, gradient: Floats) -> Floats:
-        return -self.solved(gradient[:, None])[:, 0]
-
-    def solved(self, right: Floats) -> Floats:
-        """The inverse of the Hessian, the posterior's precision, times columns, (k, m)."""
-        root = 1.0 / np.sqrt(self.precision)[:, None]
-        if self._factor is not None:
-            found: Floats = root * cho_solve(self._factor, root * right, check_finite=False)
-            return found
-        values, vectors = self._eigen  # with the prior none is below 1, whatever round-off says
-        return np.asarray(root * (vectors @ (vectors.T @ (root * right) / np.maximum(values, 1.0)[:, None])))
-
-    @cached_property
-    def _inverse(self) -> Floats:
-        """Of the Hessian."""
-        return self.solved(np.eye(self.problem.size))
-
-    @cached_property
-    def _whole(self) -> Floats:
-        """The whole step."""
-        return self._whole_for(self.gradient)
-
-    def objective(self, evaluation: Evaluation, loss: Loss) -> float:
-        """Robust distances and prior at these scales."""
-        prior = 0.5 * float(self.precision @ evaluation.coefficients**2)
-        scaled = self.problem.residuals(evaluation, self.own) / self.deviations
-        off = self.problem.landmark_residuals(evaluation)
-        leaning = self.problem.normal_residuals(evaluation, self.evaluation.match)
-        beside = float(landmarks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
-        return float(loss.value(scaled).sum()) + beside + prior
-
-    @property
-    def length(self) -> float:
-        """Length of the whole step in posterior deviations a coefficient."""
-        return _length(self._whole, self.gradient)
-
-    def length_for(self, evaluation: Evaluation) -> float:
-        """The same at a trial of the same coefficients with other closest points, with these derivatives."""
-        residuals = self.problem.residuals(evaluation, self.own)
-        gradient = self._gradient(residuals, self.loss.weight(residuals / self.deviations))
-        return _length(self._whole_for(gradient), gradient)
-
-    def moved_to(self, evaluation: Evaluation) -> LocalModel:
-        """The same about a trial so near that derivatives and hyperparameters are the same there."""
-        other = copy.copy(self)
-        for name in ("_whole", "_scaled_hessian", "_factor", "_eigen", "_inverse"):
-            other.__dict__.pop(name, None)
-        residuals = self.problem.residuals(evaluation, self.own)
-        other.evaluation, other.weights = evaluation, self.loss.weight(residuals / self.deviations)
-        other._inform()
-        if not isinstance(self._known, float):
-            other._beside = self._beside + self._known @ (evaluation.coefficients - self.evaluation.coefficients)
-        other.gradient = other._gradient(residuals, other.weights)
-        other.value = other.objective(evaluation, self.loss)
-        return other
-
-    def _inform(self) -> None:
-        """What the points tell by their weights, and what is known with what was believed."""
-        trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
-        self._informed = trusted.T @ trusted + self._known
-        self._hessian = self._informed + np.diag(self.precision)
-
-    def _damped(self, damping: float) -> Floats:
-        values, vectors = self._eigen
-        root = 1.0 / np.sqrt(self.precision)
-        rotated = vectors.T @ (root * self.gradient)
-        return -root * (vectors @ (rotated / (values + damping)))
-
-    def step(self, limit: float) -> Floats:
-        """The best change of the coefficients that moves no observed node further than the limit, metres."""
-        change, damping = self._whole, 0.0
-        while self.largest_movement(change) > 1.05 * limit or self.problem.is_too_far(change):
-            self.was_whole = False
-            damping = max(1.6 * damping, 1e-8 * self._eigen[0][-1], 0.1)
-            change = self._damped(damping)
-        return change
-
-    def decrease(self, change: Floats) -> float:
-        """Decrease of the objective that the model predicts."""
-        return -float(self.gradient @ change + 0.5 * change @ self._hessian @ change)
-
-    def largest_movement(self, change: Floats) -> float:
-        """Largest predicted movement of an observed node, metres."""
-        return float(self.problem.moved(self.evaluation, change).max())
-
-    def posterior(self) -> Posterior:
-        """Laplace's approximation at the trial, with what the doubt of the hyperparameters moves."""
-        covariance = self._inverse
-        shares = np.einsum("ij,ji->i", covariance, self._informed)
-        informed = float(shares[: self.problem.error_part.stop].sum())
-        moved, spread = self._by_hyperparameters(covariance)
-        covariance = self.error_covariance() + moved @ spread @ moved.T
-        return Posterior(self.evaluation.coefficients, covariance, self.scales, informed)
-
-    def error_covariance(self) -> Floats:
-        """Of this estimate, (k, k), where the model errs as much as it was seen to, though the cloud tells less.
-
-        The estimate S (J' W D^-1 y) errs by S (P V P + J' W D^-1 D' D^-1 J) S with the larger variances V and D' of
-        the model's error in place of those that it was made with, 1 / P and D: S itself where they are the same.
-        """
-        covariance = self._inverse
-        if self.problem.error is None or self.scales.discrepancy >= 1.0:
-            return covariance
-        whole = self.eta.copy()
-        whole[DISCREPANCY] = 0.0
-        held = self.precision**2 * np.exp(self.problem.prior_variances(whole)[0])
-        root = np.sqrt(self.weights) * np.hypot(self.noise, self.rough) / self.deviations**2
-        trusted = root[:, None] * self.jacobian
-        return covariance @ (np.diag(held) + trusted.T @ trusted + self._known) @ covariance
-
-    def _by_hyperparameters(self, covariance: Floats) -> tuple[Floats, Floats]:
-        """Derivative of the mean by the logarithms of the hyperparameters, (k, h), and their covariance, (h, h)."""
-        _, slopes = self.problem.prior_variances(self.eta)
-        held = self.precision * self.evaluation.coefficients
-        columns = (slopes * held).T
-        residuals = self.problem.residuals(self.evaluation, self.own)
-        share = (self.noise / self.deviations) ** 2  # of a distance's variance that is its own noise
-        weighted = self.weights * residuals / self.deviations**2
-        columns[:, NOISE] = 2.0 * (share * weighted) @ self.jacobian
-        columns[:, DISCREPANCY] += 2.0 * ((1.0 - share) * weighted) @ self.jacobian
-        return covariance @ columns, self._evidence.covariance(self.eta)
-
-
-def _believed(problem: Problem, noise: float) -> Floats:
-    """What is believed of the hyperparameters, and a noise, metres."""
-    start = problem.hyperprior.median.copy()
-    start[NOISE] = np.log(noise)
-    return problem.hyperprior.within(start)
-
-
-def _grouped(rough: Floats) -> tuple[list[NDArray[np.int64]], Floats]:
-    """Points of like variance: numbers of those in each group, and the root mean square of it for each point, (p,)."""
-    if not rough.any():
-        return [np.arange(len(rough))], rough
-    groups = [group for group in np.array_split(np.argsort(rough), _GROUPS) if len(group)]
-    alike = np.empty_like(rough)
-    for group in groups:
-        alike[group] = np.sqrt(np.mean(rough[group] ** 2))
-    return groups, alike
-
-
-def _told(off: Floats, loss: Loss, jacobian: Callable[[], Floats]) -> tuple[Floats | float, Floats | float]:
-    """Information, (k, k), and gradient, (k,), of what pulls beside the distances and carries its own deviation.
-
-    The scales of noise and forces are found from the distances alone.
-
-    Args:
-        off: residuals over their deviations, (r,); there may be none.
-        loss: of each.
-        jacobian: their derivative by the coefficients, (r, k).
-    """
-    if not len(off):
-        return 0.0, 0.0
-    slopes, weights = jacobian(), loss.weight(off)
-    return (weights[:, None] * slopes).T @ slopes, (weights * off) @ slopes
-
-
-def _length(step: Floats, gradient: Floats) -> float:
-    return float(np.sqrt(max(-float(step @ gradient), 0.0) / len(step)))

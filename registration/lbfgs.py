@@ -12,8 +12,9 @@ from scipy.optimize import minimize
 from softtwin.reference.data.outcome import NotConverged
 
 from . import landmarks
-from .gauss_newton import IterationRecord, LocalModel, SolverResult, without_shared_noise
+from .gauss_newton import IterationRecord, SolverResult
 from .hyperparameters import LENGTH, SHARED
+from .local_model import LocalModel, without_shared_noise
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .penalties import Penalty

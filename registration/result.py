@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from .forward import State
-from .gauss_newton import IterationRecord, LocalModel
+from .gauss_newton import IterationRecord
+from .local_model import LocalModel
 from .loss import REJECTED
 from .options import NOISE
 from .outcome import Outcome

@@ -18,7 +18,7 @@ from scipy.special import chdtrc
 from .hyperparameters import LENGTH, SHARED
 
 if TYPE_CHECKING:
-    from .gauss_newton import LocalModel
+    from .local_model import LocalModel
     from .problem import Problem
 
 Floats = NDArray[np.float64]

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import embed
 from softtwin.meshes.shapes import beam
-from softtwin.registration.gauss_newton import GaussNewton, LocalModel
+from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Square
 from softtwin.registration.options import RegistrationOptions, SparseLocalisation
 from softtwin.registration.pose import Pose

@@ -9,8 +9,8 @@ import pytest
 
 from softtwin.meshes.body import Body
 from softtwin.registration.forward import reduce_model
-from softtwin.registration.gauss_newton import LocalModel
 from softtwin.registration.hyperparameters import DISCREPANCY, LogNormalPrior
+from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Square
 from softtwin.registration.options import options_for
 from softtwin.registration.pose import Pose

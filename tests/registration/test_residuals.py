@@ -14,8 +14,8 @@ from softtwin.meshes.embedding import outer_nodes
 from softtwin.meshes.grid import gridded
 from softtwin.meshes.shapes import beam
 from softtwin.registration.forward import reduce_model
-from softtwin.registration.gauss_newton import LocalModel
 from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Huber
 from softtwin.registration.pose import Pose
 from softtwin.registration.priors import PosePrior, nodal_forces

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
 from softtwin.registration.forward import reduce_model
-from softtwin.registration.gauss_newton import GaussNewton, LocalModel
+from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Huber, Loss, Square, Tukey, robust_deviation
 from softtwin.registration.options import NOISE
 from softtwin.registration.policy import POLICY

@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softtwin.meshes.body import Body
-from softtwin.registration.gauss_newton import GaussNewton, LocalModel
+from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import SHARED, LogNormalPrior
+from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Square
 from softtwin.registration.priors import nodal_forces
 from softtwin.registration.problem import Problem
