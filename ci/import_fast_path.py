@@ -2,7 +2,7 @@
 
 python ci/import_fast_path.py                  with the extras torch and mesh
 python ci/import_fast_path.py --register       with the extra register alone: meshes may then ask for mesh's packages,
-                                               and what trains a surrogate for training's
+                                               what trains a surrogate for training's, what writes data sets for zarr
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from importlib.util import find_spec
 
 FENICSX = ("dolfinx", "dolfinx_solver", "ufl", "basix", "ffcx", "petsc4py", "slepc4py")
 ABSENT = {
+    "softtwin.reference": {"zarr"},
     "softtwin.meshes": {"gmsh", "nibabel", "nrrd", "pyacvd", "pytetwild", "pyvista"},
-    "softtwin.surrogate": {"lightning", "tensorboardX"},
+    "softtwin.surrogate": {"lightning", "tensorboardX", "zarr"},
 }
 PACKAGES = ("softtwin.meshes", "softtwin.reference.data", "softtwin.surrogate", "softtwin.registration")
 

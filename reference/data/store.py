@@ -75,11 +75,17 @@ def open_store(path: Path) -> Any:
     Raises:
         StoreError: a tensors file that is truncated, of another version or no such file.
         ValueError, OSError, KeyError: a Zarr store that cannot be read.
+        ModuleNotFoundError: `zarr` is absent: `pip install 'softtwin[data]'`.
     """
     if is_tensors(path):
         return _read_tensors(path)
-    import zarr  # here, so that reading a tensors file needs none of it
-
+    try:
+        import zarr  # here: a machine that only registers has none of it
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{path}: expected the package zarr to read a data set, found none; pip install 'softtwin[data]', or make "
+            "it a tensors file with `softtwin tensors` elsewhere."
+        ) from error
     return zarr.open_group(str(path), mode="r")
 
 
