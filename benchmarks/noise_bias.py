@@ -16,6 +16,7 @@ from liver import SEQUENCES, sequence
 from robustness import forward_model, noisy, registrar_for
 
 from softtwin.registration.loss import Tukey
+from softtwin.registration.residuals import expected_distance
 
 EXPECTED_N = 0.05
 NOISES_MM = (1.0, 2.0, 5.0)
@@ -38,7 +39,8 @@ def measure(name: str, draws: int) -> list[dict[str, float]]:
                 for draw in range(draws):
                     cloud = noisy(mm)(data.clouds[frame], model.body, np.random.default_rng([draw, frame, int(mm)]))
                     match = observed.match(truth, cloud)
-                    residuals = match.distances - (observed.expected(match, 1e-3 * mm) if taken else 0.0)
+                    expected = expected_distance(observed.curvature(match), 1e-3 * mm)
+                    residuals = match.distances - (expected if taken else 0.0)
                     jacobian = state.jacobian(observed.rows(match)) / (1e-3 * mm)
                     weighted = Tukey().weight(residuals / (1e-3 * mm))[:, None] * jacobian
                     covariance = np.linalg.inv(weighted.T @ jacobian + np.eye(jacobian.shape[1]) / EXPECTED_N**2)

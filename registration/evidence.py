@@ -25,12 +25,14 @@ from scipy.optimize import minimize
 from .hyperparameters import LogNormalPrior
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 # Logarithms of variances as functions of the logarithms eta of the hyperparameters, with their derivatives.
 Known = tuple[float, Floats]  # a value and its gradient
 Variances = Callable[[Floats], tuple[Floats, Floats]]
 _DESCENT = {"maxiter": 20, "ftol": 1e-7, "gtol": 0.1, "maxls": 10}  # of a standard deviation of a logarithm
 _BEHIND = 30.0  # of the logarithm of the evidence: no descent begins so far behind the best so far
-_STEP = 0.02  # of a logarithm, for a difference
+_STEP = 1e-5  # of a logarithm, for a difference
+_AT_BOUND = 0.02  # of a logarithm: so near to a bound a hyperparameter lies at it
 _REACH = 14.0  # of a logarithm about the median: a factor of a million, beyond which sums lose their digits
 
 
@@ -123,12 +125,19 @@ class Hyperprior:
 
     @cached_property
     def bend(self) -> Floats:
-        """Second derivatives of the cost, (h,)."""
+        """Second derivatives of the cost above the medians, (h,)."""
         return 1.0 / np.where(self.spread > 0.0, self.spread, 1.0) ** 2
+
+    def bend_at(self, eta: Floats) -> Floats:
+        """The same below the medians, too."""
+        return 1.0 / self._spread_at(eta) ** 2
+
+    def _spread_at(self, eta: Floats) -> Floats:
+        return np.where(self.spread > 0.0, np.where(eta < self.median, self.below, self.spread), 1.0)
 
     def cost(self, eta: Floats) -> tuple[float, Floats]:
         """Minus the logarithm of the density, and its gradient."""
-        spread = np.where(self.spread > 0.0, np.where(eta < self.median, self.below, self.spread), 1.0)
+        spread = self._spread_at(eta)
         scaled = np.where(self.spread > 0.0, eta - self.median, 0.0) / spread
         return 0.5 * float(scaled @ scaled), scaled / spread
 
@@ -158,15 +167,11 @@ class Evidence:
         problem = self.problem
         (noise, by_noise), (logs, slopes) = self.noise(eta), self.prior(eta)
         precision, root = np.exp(-noise), np.exp(0.5 * logs)
-        matrix, projection = problem.weighted(precision)
-        matrix *= root[:, None]
-        matrix *= root
-        matrix[np.diag_indices(len(root))] += 1.0 + _rounding(matrix)
+        matrix, projection = self._scaled(precision, root)
         factor, failed = dpotrf(matrix.T, lower=True, clean=False, overwrite_a=True)  # by columns: nothing is copied
         if failed:
             return np.inf, np.zeros_like(eta), np.ones_like(eta)
         half = float(np.log(np.diag(factor)).sum())
-        projection = root * projection
         mean, _ = dpotrs(factor, projection, lower=True)  # over the roots of the variances
         inverse, _ = dpotri(factor, lower=True, overwrite_c=True)
         believed, gradient = self.hyperprior.cost(eta)
@@ -186,11 +191,20 @@ class Evidence:
     def mean(self, eta: Floats) -> Floats:
         """The unknowns' posterior mean at logarithms of the hyperparameters, (k,)."""
         root = np.exp(0.5 * self.prior(eta)[0])
-        matrix, projection = self.problem.weighted(np.exp(-self.noise(eta)[0]))
-        matrix = matrix * root[:, None] * root
-        matrix[np.diag_indices(len(root))] += 1.0 + _rounding(matrix)
-        found: Floats = root * np.linalg.solve(matrix, root * projection)
+        matrix, projection = self._scaled(np.exp(-self.noise(eta)[0]), root)
+        factor, failed = dpotrf(matrix.T, lower=True, clean=False, overwrite_a=True)
+        if failed:
+            raise np.linalg.LinAlgError("Evidence.mean: what is known of the unknowns is not finite.")
+        found: Floats = root * dpotrs(factor, projection, lower=True)[0]
         return found
+
+    def _scaled(self, precision: Floats, root: Floats) -> tuple[Floats, Floats]:
+        """Precision of the unknowns over the roots of their prior variances, (k, k), and B' W y over them, (k,)."""
+        matrix, projection = self.problem.weighted(precision)
+        matrix *= root[:, None]
+        matrix *= root
+        matrix[np.diag_indices(len(root))] += 1.0 + _rounding(matrix)
+        return matrix, root * projection
 
     def maximum(self, starts: Sequence[Floats]) -> Floats:
         """The most likely logarithms of the hyperparameters, (h,): the best of the descents from several starts.
@@ -240,21 +254,57 @@ class Evidence:
             eta: at the maximum, (h,).
         """
         hyperprior = self.hyperprior
-        inside = (eta > hyperprior.lowest + _STEP) & (eta < hyperprior.highest - _STEP)
+        inside = (eta > hyperprior.lowest + _AT_BOUND) & (eta < hyperprior.highest - _AT_BOUND)
         places = np.flatnonzero(hyperprior.is_sought & inside)
         covariance = np.zeros((len(eta), len(eta)))
         if not len(places):
             return covariance
-        here, rows = self.value(eta)[1], []
-        for place in places:
-            moved = eta.copy()
-            moved[place] += _STEP
-            rows.append((self.value(moved)[1] - here)[places] / _STEP)
         spread = hyperprior.spread[places]
-        values, vectors = np.linalg.eigh(0.5 * (np.array(rows) + np.array(rows).T) * spread[:, None] * spread)
+        curvature = self.curvature(eta, places) * spread[:, None] * spread
+        values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
         root = spread[:, None] * vectors / np.sqrt(np.maximum(values, 1.0))  # in no direction wider than was believed
         covariance[np.ix_(places, places)] = root @ root.T
         return covariance
+
+    def curvature(self, eta: Floats, places: Ints) -> Floats:
+        """Second derivatives of minus the logarithm, (q, q), exact but for those of the variances.
+
+        With A = S^-1 scaled by the roots of v, z = m / sqrt(v), and N_b the part of A that the groups' variances change
+        with a hyperparameter b, S changes by S (diag(s_b) + N_b) S and m by S (s_b z - c_b), where s_b are the slopes
+        of log v and c_b those of what the residuals at m pull; the gradient is differentiated by these.
+
+        Args:
+            eta: logarithms of the hyperparameters, (h,).
+            places: which of them, (q,).
+        """
+        problem = self.problem
+        (noise, by_noise), (logs, slopes) = self.noise(eta), self.prior(eta)
+        precision, root = np.exp(-noise), np.exp(0.5 * logs)
+        matrix, projection = self._scaled(precision, root)
+        inverse = np.linalg.inv(matrix)
+        mean = inverse @ projection
+        spread, moved = root[:, None] * inverse * root, root * mean
+        upon = problem.projection - problem.information @ moved  # what the residuals of each group pull, (g, k)
+        data = problem.square + problem.tail - 2.0 * problem.projection @ moved
+        data += problem.upper @ (spread + moved[:, None] * moved).ravel()
+        told, fit = 1.0 - np.diag(inverse) - mean**2, problem.count - precision * data
+        found = np.zeros((len(places), len(places)))
+        for column, place in enumerate(places):
+            nearby = eta.copy()
+            nearby[place] += _STEP
+            bent = (self.prior(nearby)[1] - slopes)[places] / _STEP, (self.noise(nearby)[1] - by_noise)[places] / _STEP
+            slope, weighed = slopes[place], by_noise[place] * precision
+            grown = np.diag(slope)
+            if weighed.any():
+                part = (weighed @ problem.information.reshape(len(weighed), -1)).reshape(matrix.shape)
+                grown += root[:, None] * part * root
+            changed = inverse @ grown @ inverse
+            shift = inverse @ (slope * mean - root * (weighed @ upon))
+            by_prior = slope * (np.diag(inverse) + mean**2) - np.diag(changed) - 2.0 * mean * shift
+            by_data = problem.upper @ (root[:, None] * changed * root).ravel() - 2.0 * upon @ (root * shift)
+            by_groups = weighed * data - precision * by_data
+            found[:, column] = slopes[places] @ by_prior + by_noise[places] @ by_groups + bent[0] @ told + bent[1] @ fit
+        return 0.5 * found + np.diag(self.hyperprior.bend_at(eta)[places])
 
 
 def _put(places: NDArray[np.bool_], values: Floats) -> Floats:

@@ -22,7 +22,7 @@ from .score import gain_by_shared_noise
 Floats = NDArray[np.float64]
 _ROUGH = 15  # iterations that a start is worth
 _UNSHARED = 8  # iterations in which points far off are told, before noise that neighbours share is thought of
-_KEPT = 0.2  # a whole step that misses its promise by less: where only a start is wanted, it was the last
+_KEPT = 0.2  # a whole step that misses its promise by less: derivatives have hardly changed on its way
 _TRUSTED = 3.0  # deviations
 _NEARER = 1e-3  # part of the objective that closest points searched anew must take away to go on
 _UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
@@ -114,7 +114,8 @@ class GaussNewton:
         minimum_step: no step that moves all observed nodes less than this is tried, metres.
         trusted: before the end closest points are searched anew, of points further from the surface than so many of
             their deviations; 0 for all.
-        keeps_scales: hyperparameters that are known at the start are sought anew with the last loss alone.
+        is_near: the start is near: hyperparameters that are known there are sought anew with the last loss alone, and
+            whether a step was the last is seen by the derivatives before it, where it kept what they promised.
         until: no step is begun after this time of the monotonic clock, seconds.
     """
 
@@ -127,7 +128,7 @@ class GaussNewton:
     max_step: float = 0.05
     minimum_step: float = 1e-6
     trusted: float = 0.0
-    keeps_scales: bool = False
+    is_near: bool = False
     until: float = np.inf
 
     def __post_init__(self) -> None:
@@ -148,7 +149,7 @@ class GaussNewton:
 
     def following(self) -> GaussNewton:
         """The same from the state of a frame before: closest points and scales stay the same over so short a way."""
-        return replace(self, trusted=max(self.trusted, _TRUSTED), keeps_scales=True)
+        return replace(self, trusted=max(self.trusted, _TRUSTED), is_near=True)
 
     def without_steps(self) -> GaussNewton:
         """The same, which takes any start for the end: to judge it."""
@@ -197,7 +198,6 @@ class _Search:
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
         self.own, self.begun = 0.0, 0
         self.eta, self.starts = eta, list[Floats]()
-        self.keeps_scales = options.keeps_scales and eta is not None
         self.trace: list[IterationRecord] = []
         self._at: LocalModel | None = None
 
@@ -253,8 +253,8 @@ class _Search:
         """The model about the trial; what is known there already is not computed again."""
         at = self._at
         if at is None or at.evaluation is not self.evaluation or at.loss is not loss:
-            jacobian = None if at is None or at.evaluation is not self.evaluation else at.jacobian
-            is_held = self.keeps_scales and loss is not self.options.losses[-1]
+            is_there = at is not None and at.evaluation is self.evaluation
+            is_held = self.options.is_near and self.eta is not None and loss is not self.options.losses[-1]
             starts = self.starts if at is None or at.loss is not loss else [at.eta]
             at = LocalModel(
                 self.problem,
@@ -262,19 +262,28 @@ class _Search:
                 loss,
                 self.noise,
                 self.options.graduation,
-                jacobian,
+                at.jacobian if at is not None and is_there else None,
                 starts or [self._without()],
                 self.own,
                 is_held=is_held,
+                linearised_at=at.linearised_at if at is not None and is_there else None,
             )
             self._at, self.noise, self.own, self.eta, self.starts = at, at.noise, at.own, at.eta, []
         return at
+
+    def _renewed(self, loss: Loss) -> LocalModel:
+        """The same with derivatives at the trial itself."""
+        before = self._local(loss)
+        self._at, self.starts = None, [before.eta]
+        return self._local(loss)
 
     def _descend(self, loss: Loss, settled: float, most: int = 0) -> Outcome:
         most = len(self.trace) + most if most else self.begun + self.options.max_iterations
         is_handed_on, is_exact = settled >= self.options.handed_on, False
         while len(self.trace) < most:
             local = self._local(loss)
+            if local.is_carried and (local.length >= settled or local.is_graduated):
+                local = self._renewed(loss)
             if local.length < settled and not local.is_graduated:
                 if is_handed_on or is_exact:
                     return Outcome.CONVERGED
@@ -299,7 +308,7 @@ class _Search:
         coefficients = self.evaluation.coefficients + local.step(self.limit)
         with suppress(NotConverged):
             self.evaluations += 1
-            after = local.moved_to(self.problem.evaluation(coefficients, self.evaluation))
+            after = local.moved_to(self.problem.nearby(coefficients, self.evaluation))
             if after.value < local.value:
                 self.evaluation = after.evaluation
                 return after
@@ -341,6 +350,8 @@ class _Search:
             self.limit = _next_limit(self.limit, largest, gain)
             if gain > 0.0:
                 self.evaluation = evaluation
+                if self.options.is_near and local.was_whole and abs(gain - 1.0) < _KEPT:
+                    self._at = local.moved_to(evaluation)
                 self.trace.append(
                     IterationRecord(
                         evaluation.match.rms, value, local.noise, local.scales.force, largest, local.length, gain

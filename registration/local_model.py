@@ -20,6 +20,7 @@ from .posterior import Posterior
 from .problem import Evaluation, Problem
 
 Floats = NDArray[np.float64]
+_ALIKE = 0.02  # of all weights: what points tell is not summed anew for a smaller change of them
 _GROUPS = 6  # of points, by how far the model's error makes them doubtful
 
 
@@ -36,6 +37,7 @@ class LocalModel:
         starts: logarithms of hyperparameters that the search for them begins with; those that are believed if none.
         own: the points' own noise so far, metres, without what is yet to be explained; None for all of it.
         is_held: the hyperparameters are the first of the starts, and not sought.
+        linearised_at: trial nearby whose derivatives these are; this one if not given.
     """
 
     def __init__(
@@ -50,8 +52,10 @@ class LocalModel:
         own: float | None = None,
         *,
         is_held: bool = False,
+        linearised_at: Evaluation | None = None,
     ) -> None:
         self.problem, self.evaluation, self.loss = problem, evaluation, loss
+        self.linearised_at = evaluation if linearised_at is None else linearised_at
         self.was_whole, self.own = True, noise if own is None else own
         self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
         off, leaning = problem.landmark_residuals(evaluation), problem.normal_residuals(evaluation)
@@ -60,6 +64,7 @@ class LocalModel:
         self._known, self._beside = by_marks + by_normals, pull_by_marks + pull_by_normals
         self._groups, self.rough = _grouped(problem.rough(evaluation))
         start = problem.hyperprior.within(starts[0]) if len(starts) else _believed(problem, noise)
+        self.counted: Floats  # weights that what the points tell is summed with, (p,)
         self._evidence = self._evidence_near(start, noise)
         if is_held:
             self.eta, self.is_graduated = start, False
@@ -70,10 +75,17 @@ class LocalModel:
         self.deviations = np.hypot(self.noise, self.scales.discrepancy * self.rough)
         residuals = problem.residuals(evaluation, self.own)
         self.weights = loss.weight(residuals / self.deviations)
+        if np.abs(self.weights - self.counted).sum() > _ALIKE * self.weights.sum():
+            summed = replace(self._evidence_of(residuals, self.weights).problem, tail=self._evidence.problem.tail)
+            self._evidence, self.counted = replace(self._evidence, problem=summed), self.weights
         self.precision = np.exp(-problem.prior_variances(self.eta)[0])
         self._inform()
         self.gradient = self._gradient(residuals, self.weights)
-        self.value = self.objective(evaluation, loss)
+
+    @property
+    def is_carried(self) -> bool:
+        """Whether the derivatives are those of a trial nearby."""
+        return self.linearised_at is not self.evaluation
 
     def _gradient(self, residuals: Floats, weights: Floats) -> Floats:
         by_distances = weights * residuals / self.deviations**2
@@ -88,9 +100,16 @@ class LocalModel:
             eta: logarithms of hyperparameters near those sought, (5,).
             noise: standard deviation of a point's distance, metres.
         """
+        residuals = self.problem.residuals(self.evaluation, self.own)
+        self.counted = self.loss.weight(residuals / np.hypot(noise, np.exp(eta[DISCREPANCY]) * self.rough))
+        found = self._evidence_of(residuals, self.counted)
+        left = self.counted * (residuals + self.jacobian @ (found.mean(eta) - self.evaluation.coefficients)) ** 2
+        tail = (1.0 / self.loss.consistency - 1.0) * np.array([left[group].sum() for group in self._groups])
+        return replace(found, problem=replace(found.problem, tail=tail))
+
+    def _evidence_of(self, residuals: Floats, weights: Floats) -> Evidence:
+        """The same with given weights, (p,), and no tails."""
         problem, coefficients, groups = self.problem, self.evaluation.coefficients, self._groups
-        residuals = problem.residuals(self.evaluation, self.own)
-        weights = self.loss.weight(residuals / np.hypot(noise, np.exp(eta[DISCREPANCY]) * self.rough))
         data = self.jacobian @ coefficients - residuals
         root = np.sqrt(weights)
         parts = [root[group, None] * self.jacobian[group] for group in groups]
@@ -104,10 +123,7 @@ class LocalModel:
             known,
         )
         there = np.array([self.rough[group[0]] for group in groups])
-        found = Evidence(linear, problem.noise_variances(there), problem.prior_variances, problem.hyperprior)
-        left = weights * (data - self.jacobian @ found.mean(eta)) ** 2
-        beyond = 1.0 / self.loss.consistency - 1.0
-        return replace(found, problem=replace(linear, tail=np.array([beyond * left[group].sum() for group in groups])))
+        return Evidence(linear, problem.noise_variances(there), problem.prior_variances, problem.hyperprior)
 
     def _found(self, graduation: float, starts: list[Floats]) -> tuple[Floats, bool]:
         """Logarithms of the hyperparameters, and whether the noise is held above what the model would believe."""
@@ -123,7 +139,7 @@ class LocalModel:
     def _promised(self, evidence: Evidence, eta: Floats) -> float:
         """Root mean square change of the residuals by the best step at some hyperparameters, metres."""
         linear, step = evidence.problem, evidence.mean(eta) - self.evaluation.coefficients
-        square = float(np.einsum("gij,i,j->", linear.information, step, step, optimize=True))
+        square = float((linear.information @ step @ step).sum())
         return float(np.sqrt(max(square, 0.0) / max(linear.count.sum(), 1.0)))
 
     @cached_property
@@ -168,6 +184,11 @@ class LocalModel:
         """The whole step."""
         return self._whole_for(self.gradient)
 
+    @cached_property
+    def value(self) -> float:
+        """Of the objective at the trial."""
+        return self.objective(self.evaluation, self.loss)
+
     def objective(self, evaluation: Evaluation, loss: Loss) -> float:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ evaluation.coefficients**2)
@@ -189,23 +210,21 @@ class LocalModel:
         return _length(self._whole_for(gradient), gradient)
 
     def moved_to(self, evaluation: Evaluation) -> LocalModel:
-        """The same about a trial so near that derivatives and hyperparameters are the same there."""
+        """The same about a trial so near that derivatives, hyperparameters and what the points tell are the same."""
         other = copy.copy(self)
-        for name in ("_whole", "_scaled_hessian", "_factor", "_eigen", "_inverse"):
+        other.was_whole = True
+        for name in ("_whole", "value"):
             other.__dict__.pop(name, None)
         residuals = self.problem.residuals(evaluation, self.own)
         other.evaluation, other.weights = evaluation, self.loss.weight(residuals / self.deviations)
-        other._inform()
         if not isinstance(self._known, float):
             other._beside = self._beside + self._known @ (evaluation.coefficients - self.evaluation.coefficients)
         other.gradient = other._gradient(residuals, other.weights)
-        other.value = other.objective(evaluation, self.loss)
         return other
 
     def _inform(self) -> None:
-        """What the points tell by their weights, and what is known with what was believed."""
-        trusted = (np.sqrt(self.weights) / self.deviations)[:, None] * self.jacobian
-        self._informed = trusted.T @ trusted + self._known
+        """What the points tell by the weights that they were counted with, and what was believed."""
+        self._informed = self._evidence.problem.weighted(np.exp(-self._evidence.noise(self.eta)[0]))[0]
         self._hessian = self._informed + np.diag(self.precision)
 
     def _damped(self, damping: float) -> Floats:
@@ -229,7 +248,7 @@ class LocalModel:
 
     def largest_movement(self, change: Floats) -> float:
         """Largest predicted movement of an observed node, metres."""
-        return float(self.problem.moved(self.evaluation, change).max())
+        return float(self.problem.moved(self.linearised_at, change).max())
 
     def posterior(self) -> Posterior:
         """Laplace's approximation at the trial, with what the doubt of the hyperparameters moves."""
@@ -252,9 +271,9 @@ class LocalModel:
         whole = self.eta.copy()
         whole[DISCREPANCY] = 0.0
         held = self.precision**2 * np.exp(self.problem.prior_variances(whole)[0])
-        root = np.sqrt(self.weights) * np.hypot(self.noise, self.rough) / self.deviations**2
-        trusted = root[:, None] * self.jacobian
-        return covariance @ (np.diag(held) + trusted.T @ trusted + self._known) @ covariance
+        believed, seen = (self._evidence.noise(each)[0] for each in (self.eta, whole))
+        told = self._evidence.problem.weighted(np.exp(seen - 2.0 * believed))[0]
+        return covariance @ (np.diag(held) + told) @ covariance
 
     def _by_hyperparameters(self, covariance: Floats) -> tuple[Floats, Floats]:
         """Derivative of the mean by the logarithms of the hyperparameters, (k, h), and their covariance, (h, h)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, cast
 
@@ -20,7 +20,7 @@ from .parameter_blocks import ParameterBlocks
 from .policy import POLICY
 from .pose import Pose
 from .priors import ModelError, NodalForces, PosePrior
-from .residuals import Correspondence, SurfaceDistance
+from .residuals import Correspondence, SurfaceDistance, expected_distance
 from .surface_modes import SurfaceModes
 
 Floats = NDArray[np.float64]
@@ -48,6 +48,18 @@ class Evaluation:
     pose: Pose | None
     cloud: Floats
     match: Correspondence
+    _known: dict[Any, Floats] = field(default_factory=dict, init=False, repr=False)
+
+    def once(self, key: Any, found: Callable[[], Floats]) -> Floats:
+        """What depends on this trial alone, found when it is first asked for.
+
+        Args:
+            key: names it.
+            found: finds it.
+        """
+        if key not in self._known:
+            self._known[key] = found()
+        return self._known[key]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +176,7 @@ class Problem:
         if self.error is None:
             return np.zeros(len(self.cloud))
         field = self.error.rest_modes.modes @ evaluation.coefficients[self.rest_part]
-        there = self.observed.at_points(evaluation.match, self.error.distance_deviation)
-        return there * self.observed.at_vertices(evaluation.match, field)
+        return self.rough(evaluation) * self.observed.at_vertices(evaluation.match, field)
 
     def rough(self, evaluation: Evaluation) -> Floats:
         """Standard deviation of each distance by what the model gets wrong from point to point, (p,), metres.
@@ -174,15 +185,15 @@ class Problem:
         """
         if self.error is None:
             return np.zeros(len(self.cloud))
-        return self.observed.at_points(evaluation.match, self.error.distance_deviation)
+        deviation = self.error.distance_deviation
+        return evaluation.once((self.error, "rough"), lambda: self.observed.at_points(evaluation.match, deviation))
 
     def _by_distances(self, evaluation: Evaluation) -> Floats:
         """Derivative of the residuals by the coefficients that change the distances alone, (p, q)."""
         match, columns = evaluation.match, [np.zeros((len(self.cloud), 0))]
         if self.error is not None:
             corners = self.observed.triangles[match.triangles]
-            there = self.observed.at_points(match, self.error.distance_deviation)
-            columns.append(-there[:, None] * self.error.rest_modes.at(corners, match.weights))
+            columns.append(-self.rough(evaluation)[:, None] * self.error.rest_modes.at(corners, match.weights))
         if self.shared is not None:
             columns.append(self.by_shared_noise(evaluation))
         return np.hstack(columns)
@@ -277,6 +288,18 @@ class Problem:
         from_match = None if near is None or anew else near.match
         return self._at(coefficients, near, lambda moved, cloud: self.observed.match(moved, cloud, from_match))
 
+    def nearby(self, coefficients: Floats, near: Evaluation) -> Evaluation:
+        """The same so near a trial that each point's closest one stays on its triangle.
+
+        Args:
+            coefficients: (k,).
+            near: the trial.
+
+        Raises:
+            NotConverged: the model found no state.
+        """
+        return self._at(coefficients, near, lambda moved, cloud: self.observed.match_held(moved, cloud, near.match))
+
     def begun(self, coefficients: Floats, near: Evaluation | None = None) -> Evaluation:
         """The same for another cloud than the trial's: closest points by the nearest vertices, good for a start.
 
@@ -320,8 +343,11 @@ class Problem:
             evaluation: at some coefficients.
             noise: standard deviation of each coordinate of a point, metres.
         """
-        expected = self.observed.expected(evaluation.match, noise)
-        return evaluation.match.distances - expected - self.shared_noise(evaluation) - self.left_out(evaluation)
+        curvature = evaluation.once("curvature", lambda: self.observed.curvature(evaluation.match))
+        unexplained = evaluation.once(
+            self, lambda: evaluation.match.distances - self.shared_noise(evaluation) - self.left_out(evaluation)
+        )
+        return unexplained - expected_distance(curvature, noise)
 
     def again(self, evaluation: Evaluation, beyond: float = 0.0) -> Evaluation:
         """The same trial with closest points searched anew.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, kron
 
 from softtwin.meshes.body import Body, Surface
-from softtwin.meshes.closest import ClosestPoints
+from softtwin.meshes.closest import ClosestPoints, closest_in_triangles
 from softtwin.meshes.curvature import mean_curvature
 from softtwin.meshes.embedding import outer
 
@@ -108,6 +108,18 @@ class SurfaceDistance:
         if near is None:
             return self._matched(positions, cloud, *self._closest.find(positions, cloud))
         return self._matched(positions, cloud, *self._closest.follow(positions, cloud, near.triangles))
+
+    def match_held(self, displacement: Floats, cloud: Floats, near: Correspondence) -> Correspondence:
+        """The same on the triangles of a match: the closest where the surface has moved much less than an edge.
+
+        Args:
+            displacement: of the nodes `nodes`, (m, 3), metres.
+            cloud: points, (p, 3), metres.
+            near: a match of the same cloud.
+        """
+        positions = self.rest + self._carried(displacement)
+        weights = closest_in_triangles(positions[self.triangles[near.triangles]], cloud)[0]
+        return self._matched(positions, cloud, near.triangles, weights)
 
     def match_nearby(self, displacement: Floats, cloud: Floats) -> Correspondence:
         """The same by a walk from each point's nearest vertex: faster than anew, in rare places not the closest.
@@ -229,20 +241,9 @@ class SurfaceDistance:
         """Displacements of the vertices from those of the nodes, (3v, 3m); None where they are the same."""
         return None if self._weights is None else csr_array(kron(self._weights, np.eye(3), format="csr"))
 
-    def expected(self, match: Correspondence, noise: float) -> Floats:
-        """Mean of the signed distances of points that noise has moved from where they were matched, (p,), metres.
-
-        Noise leaves more points outside a round surface than inside: by sigma^2 H where the mean curvature H is small
-        (the second-order mean of the distance) and by sigma sqrt(8 / pi) about a tip, which has no inside. Noise is
-        taken as the same in all directions, curvature as at rest.
-
-        Args:
-            match: of the cloud.
-            noise: standard deviation of each coordinate of a point, metres.
-        """
-        bent = noise * np.einsum("pk,pk->p", match.weights, self._curvature[self.triangles[match.triangles]])
-        mean: Floats = -noise * bent / (1.0 + np.sqrt(np.pi / 8.0) * np.abs(bent))
-        return mean
+    def curvature(self, match: Correspondence) -> Floats:
+        """Mean curvature of the observed side at rest at the closest points of a match, (p,), 1/m."""
+        return self.at_vertices(match, self._curvature)
 
     @cached_property
     def edge(self) -> float:
@@ -265,6 +266,22 @@ class SurfaceDistance:
             np.add.at(share, self.triangles[:, corner], np.linalg.norm(areas, axis=1) / 3.0)
         lengths = np.maximum(np.linalg.norm(sums, axis=1), 1e-300)
         return sums / lengths[:, None], share / share.sum()
+
+
+def expected_distance(curvature: Floats, noise: float) -> Floats:
+    """Mean of the signed distances of points that noise has moved from where they were matched, (p,), metres.
+
+    Noise leaves more points outside a round surface than inside: by sigma^2 H where the mean curvature H is small (the
+    second-order mean of the distance) and by sigma sqrt(8 / pi) about a tip, which has no inside. Noise is taken as
+    the same in all directions, curvature as at rest.
+
+    Args:
+        curvature: mean curvature H, (p,), 1/m.
+        noise: standard deviation of each coordinate of a point, metres.
+    """
+    bent = noise * curvature
+    mean: Floats = -noise * bent / (1.0 + np.sqrt(np.pi / 8.0) * np.abs(bent))
+    return mean
 
 
 def _normals(corners: Floats) -> tuple[Floats, Floats]:

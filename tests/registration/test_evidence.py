@@ -88,6 +88,15 @@ def test_its_gradient_is_exact(rng: np.random.Generator, has_known: bool) -> Non
     np.testing.assert_allclose(evidence.value(eta)[1], slopes, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("has_known", [False, True])
+def test_its_curvature_is_exact(rng: np.random.Generator, has_known: bool) -> None:
+    """Beside differences of the gradient."""
+    evidence, eta = Drawn(rng, np.log([0.3, 2.0, 0.2]), has_known).evidence, np.log([0.2, 2.5, 0.4])
+    steps = 1e-5 * np.eye(3)
+    slopes = [evidence.value(eta + step)[1] - evidence.value(eta - step)[1] for step in steps]
+    np.testing.assert_allclose(evidence.curvature(eta, np.arange(3)), np.array(slopes) / 2e-5, rtol=1e-5, atol=1e-4)
+
+
 def test_scales_that_data_were_drawn_with_are_found_within_their_doubt() -> None:
     truth, off = np.log([0.3, 2.0, 0.5]), []
     for seed in range(60):
