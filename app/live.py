@@ -83,7 +83,7 @@ def register_live(
         CloudError: none of the clouds could be registered at all; their frames are written all the same.
         ConfigError: a budget that is no positive number; landmarks that this twin cannot take.
     """
-    sequence = Sequence(twin, zone, camera)
+    sequence = Sequence(twin, zone, camera, is_live=True)
     if frame_landmarks is not None:
         frame_landmarks.check(twin)
     with Recorder(Exporter(twin, output, formats), zone) as recorder:

@@ -38,6 +38,7 @@ from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.result import Registration
 from softtwin.registration.rigid import align
+from softtwin.registration.tracker import Tracker
 from softtwin.registration.verdict import Judgement, Verdict
 
 from .config import Config, ConfigError, RegistrationSection, files_axes, parse_config
@@ -261,32 +262,24 @@ class Twin:
 
         return self._posed_result(cloud, zone, camera, run)
 
-    def follow(
-        self,
-        cloud: ArrayLike,
-        zone: str | None,
-        last: Registration | None,
-        camera: Camera,
-        until: float = np.inf,
-        landmarks: Landmarks | None = None,
-    ) -> Registration:
-        """A cloud registered from the last frame, and from rest where that is not accepted; see `Registrar.follow`.
+    def ways(
+        self, zone: str | None, camera: Camera, until: float = np.inf, landmarks: Landmarks | None = None
+    ) -> TwinWays:
+        """How the next cloud of a sequence can be registered.
 
         Args:
-            cloud: as for `register`.
             zone: as for `register`.
-            last: result of the last usable frame.
             camera: where the camera stands.
-            until: no step is begun after this time of the monotonic clock, seconds.
+            until: no step is begun after this time of the monotonic clock, seconds; a search beside the frames has no
+                such limit.
             landmarks: as for `register`.
         """
-        camera = camera or self.as_said
+        return TwinWays(self, zone, camera or self.as_said, until, landmarks)
 
-        def run(registrar: Engine, points: Floats) -> Registration:
-            limited = registrar.limited(until) if until < np.inf else registrar
-            return self._marked(limited, landmarks, None, camera).follow(points, last)
-
-        return self._posed_result(cloud, zone, camera, run)
+    @property
+    def is_concurrent(self) -> bool:
+        """Whether clouds can be registered in two threads at a time."""
+        return isinstance(self.registrar(), Registrar) and bool(getattr(self.model, "is_concurrent", False))
 
     def _marked(
         self, registrar: Engine, landmarks: Landmarks | None, deviation: float | None, camera: Camera
@@ -498,6 +491,49 @@ class Twin:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class TwinWays:
+    """A cloud from rest or from the last frame, as `Tracker` asks for it; the arguments are those of `Twin.ways`."""
+
+    twin: Twin
+    zone: str | None
+    camera: Camera
+    until: float
+    landmarks: Landmarks | None
+    before_step: Callable[[], None] | None = None
+
+    def beside(self, before_step: Callable[[], None]) -> TwinWays:
+        """The same for a thread beside the frames: see `Registrar.beside`."""
+        return replace(self, before_step=before_step)
+
+    def track(self, cloud: ArrayLike, last: Registration) -> Registration:
+        """From the last state alone: see `Registrar.track`."""
+        return self._run(cloud, lambda engine, points: _registrar(engine).track(points, last))
+
+    def follow(self, cloud: ArrayLike, last: Registration | None) -> Registration:
+        """From the last state, and from rest where that is not accepted: see `Registrar.follow`."""
+        return self._run(cloud, lambda engine, points: engine.follow(points, last))
+
+    def is_lost(self, found: Registration, last: Registration) -> bool:
+        """Whether what was tracked has to be searched for from rest: see `Registrar.is_lost`."""
+        camera = self.camera if isinstance(self.camera, PosePrior) else None
+        return _registrar(self.twin.registrar(self.zone, camera)).is_lost(found, last)
+
+    def _run(self, cloud: ArrayLike, follow: Callable[[Engine, Floats], Registration]) -> Registration:
+        def run(registrar: Engine, points: Floats) -> Registration:
+            limited = registrar.limited(self.until) if self.until < np.inf else registrar
+            if self.before_step is not None:
+                limited = _registrar(registrar).beside(self.before_step)
+            return follow(self.twin._marked(limited, self.landmarks, None, self.camera), points)
+
+        return self.twin._posed_result(cloud, self.zone, self.camera, run)
+
+
+def _registrar(engine: Engine) -> Registrar:
+    assert isinstance(engine, Registrar)  # others are not concurrent, and are not tracked alone
+    return engine
+
+
 class Sequence:
     """Frames of one twin, each registered from what the last usable one found.
 
@@ -505,11 +541,13 @@ class Sequence:
         twin: the twin.
         zone: as for `Twin.register`.
         camera: where the camera stands.
+        is_live: no answer waits for a search from rest, which a twin whose model is a network does beside the frames;
+            what is found when depends on time then.
     """
 
-    def __init__(self, twin: Twin, zone: str | None = None, camera: Camera = None) -> None:
+    def __init__(self, twin: Twin, zone: str | None = None, camera: Camera = None, *, is_live: bool = False) -> None:
         self.twin, self.zone, self.camera = twin, zone, camera
-        self._last: Registration | None = None
+        self._tracker = Tracker(background=is_live and twin.is_concurrent)
         self._count = 0
         twin.registrar(zone)  # a zone that is not there is said before the first cloud
 
@@ -530,11 +568,9 @@ class Sequence:
             points = given.array()
             if self.camera == "align":
                 self.camera = self.twin.aligned(points)
-            result = self.twin.follow(points, self.zone, self._last, self.camera, until, landmarks)
+            result = self._tracker.take(points, self.twin.ways(self.zone, self.camera, until, landmarks))
         except (CloudError, NotConverged) as error:
             return self.refuse(str(error), time.perf_counter() - begin)
-        if result.judgement.is_usable:
-            self._last = result
         count = 0 if landmarks is None else len(np.asarray(landmarks[0]))
         seconds = time.perf_counter() - begin
         return Frame(self._next(), result.judgement, result, seconds, points[:, :3], count, given.missing)

@@ -335,7 +335,7 @@ def pace(given: Given) -> dict[str, Any]:
     """Seconds of a warm frame of the quickstart's twin, as a stream of 60 clouds a second asks for them."""
     with Twin.open(given.quickstart, "surrogate", pose="fixed") as twin:
         clouds = stream.clouds_of(twin, stream.path_of(given.quickstart))
-        sequence = Sequence(twin, "")
+        sequence = Sequence(twin, "", is_live=True)
         sequence.register(clouds[0])
         frames = [sequence.register(clouds[EVERY * i % len(clouds)]) for i in range(1, 1 + so_many(given, PACED))]
     seconds = np.array([frame.seconds for frame in frames])

@@ -49,7 +49,7 @@ def work(row: str, given: Given) -> dict[str, Any]:
     path = path_of(given.folder)
     with Twin.open(given.folder, given.engine, pose="fixed") as twin:
         clouds = clouds_of(twin, path)
-        sequence = Sequence(twin, "")
+        sequence = Sequence(twin, "", is_live=True)
         sequence.register(clouds[0])  # everything is prepared
         begun: list[float] = []
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -117,6 +118,7 @@ class GaussNewton:
         is_near: the start is near: hyperparameters that are known there are sought anew with the last loss alone, and
             whether a step was the last is seen by the derivatives before it, where it kept what they promised.
         until: no step is begun after this time of the monotonic clock, seconds.
+        before_step: called before each; it may wait.
     """
 
     losses: tuple[Loss, ...] = (Huber(), Tukey())
@@ -130,6 +132,7 @@ class GaussNewton:
     trusted: float = 0.0
     is_near: bool = False
     until: float = np.inf
+    before_step: Callable[[], None] | None = None
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1:
@@ -292,6 +295,8 @@ class _Search:
                 is_exact = True
                 continue
             is_exact = False
+            if self.options.before_step is not None:
+                self.options.before_step()
             if time.monotonic() >= self.options.until:
                 return Outcome.OUT_OF_TIME
             refused = self._step(local, loss)
@@ -308,7 +313,8 @@ class _Search:
         coefficients = self.evaluation.coefficients + local.step(self.limit)
         with suppress(NotConverged):
             self.evaluations += 1
-            after = local.moved_to(self.problem.nearby(coefficients, self.evaluation))
+            evaluated = self.problem.nearby if self.options.is_near else self.problem.evaluation
+            after = local.moved_to(evaluated(coefficients, self.evaluation))
             if after.value < local.value:
                 self.evaluation = after.evaluation
                 return after

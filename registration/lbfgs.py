@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +40,7 @@ class LBFGS:
         penalty: what forces cost in place of their Gaussian prior; None for that. What is said of doubt is by the
             prior all the same.
         until: no state is looked for after this time of the monotonic clock, seconds.
+        before_step: called before each; it may wait.
     """
 
     losses: tuple[Loss, ...] = (Huber(), Huber(), Tukey())
@@ -47,6 +49,7 @@ class LBFGS:
     tolerance: float = 1e-9
     penalty: Penalty | None = None
     until: float = np.inf
+    before_step: Callable[[], None] | None = None
 
     def __post_init__(self) -> None:
         if self.max_iterations < 1 or self.memory < 1:
@@ -131,6 +134,8 @@ class _Run:
 
         def evaluate(scaled: Floats) -> tuple[float, Floats]:
             nonlocal minimum, met_wall
+            if self.options.before_step is not None:
+                self.options.before_step()
             if time.monotonic() >= self.options.until:
                 raise _TimeIsOver
             self.evaluations += 1

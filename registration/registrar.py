@@ -43,6 +43,7 @@ from .priors import (
 from .problem import Evaluation, Problem
 from .residuals import SurfaceDistance
 from .result import Registration, badness
+from .tracker import Tracker
 from .verdict import Check, Code, Verdict
 
 Floats = NDArray[np.float64]
@@ -415,6 +416,41 @@ class Registrar:
         rest = self.observed.match(np.zeros_like(near.positions), few)
         return robust_deviation(rest.distances) < far
 
+    def beside(self, before_step: Callable[[], None]) -> Registrar:
+        """The same for a thread beside the frames: see `Tracker`.
+
+        Args:
+            before_step: called before each step; it may wait.
+        """
+        other = copy.copy(self)
+        other.options = replace(
+            self.options, solver=replace(self.options.solver, until=np.inf, before_step=before_step)
+        )
+        return other
+
+    def track(self, cloud: ArrayLike, last: Registration) -> Registration:
+        """The next frame of a sequence from the last one alone; see `Tracker`.
+
+        Args:
+            cloud: observed points, (p, 3), metres.
+            last: the last usable result.
+
+        Raises:
+            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+            NotConverged: the model found no state there.
+        """
+        begin = time.perf_counter()
+        return self._asked(cloud, self._followed(self._checked(cloud), last, begin))
+
+    def is_lost(self, found: Registration, last: Registration) -> bool:
+        """Whether what was tracked has to be searched for from rest: it is not accepted, or met much worse.
+
+        Args:
+            found: what was tracked.
+            last: from where.
+        """
+        return found.judgement.verdict is not Verdict.ACCEPTED or self._has_left(found, last)
+
     def _has_left(self, result: Registration, start: Registration) -> bool:
         """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
         return result.scatter > _LEFT * max(start.scatter, self.noise.minimum)
@@ -572,7 +608,7 @@ def _after(first: SolverResult, second: SolverResult) -> SolverResult:
 def register_sequence(registrar: Registrar, clouds: Iterable[ArrayLike]) -> Iterator[Registration]:
     """Register clouds in their order, as they come; the caller may stop between any two.
 
-    A frame starts from the last one that was not refused: see `Registrar.follow`.
+    A frame starts from the last one that was not refused: see `Tracker`.
 
     Args:
         registrar: model, observed side, unknowns and options.
@@ -581,9 +617,6 @@ def register_sequence(registrar: Registrar, clouds: Iterable[ArrayLike]) -> Iter
     Raises:
         CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
     """
-    last = None
+    tracker = Tracker()
     for cloud in clouds:
-        result = registrar.follow(cloud, last)
-        if result.judgement.is_usable:
-            last = result
-        yield result
+        yield tracker.take(cloud, registrar)

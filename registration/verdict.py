@@ -40,6 +40,7 @@ class Code(Enum):
     NORMALS = "normals"
     FORCES_ELSEWHERE = "forces_elsewhere"
     CONTACT = "contact"
+    TRACKING = "tracking"
 
 
 @dataclass(frozen=True)

@@ -115,6 +115,8 @@ class Surrogate:
         card: what it was trained on and how well it does.
     """
 
+    is_concurrent = True  # a state is a value: two threads may ask for states at a time
+
     def __init__(
         self, body: Body, encoder_decoder: LinearEncoderDecoder, network: Network, card: Mapping[str, Any]
     ) -> None:

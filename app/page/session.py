@@ -170,7 +170,7 @@ class Session:
         same = self._kept is not None and self._kept[0][0] == wanted[0]
         twin = self._kept[1].twin if same and self._kept is not None else self._opened(wishes.engine)
         camera = twin.near(Pose.identity()) if wishes.view.is_misaligned else self._camera
-        self._kept = wanted, Sequence(twin, None, camera)
+        self._kept = wanted, Sequence(twin, None, camera, is_live=True)
         self._answered.clear()
         return self._kept[1]
 
