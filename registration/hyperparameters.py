@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .policy import POLICY
+
 Floats = NDArray[np.float64]
 NOISE, FORCE, SHARED, LENGTH, DISCREPANCY = range(5)  # their order in arrays, that of `Hyperparameters`
 
@@ -64,3 +66,8 @@ class Hyperparameters:
     shared: float
     length: float
     discrepancy: float
+
+    @property
+    def margin_discrepancy(self) -> float:
+        """The discrepancy that margins reckon with: where it is below 1, forces may have explained some."""
+        return self.discrepancy if self.discrepancy >= 1.0 else self.discrepancy**POLICY.discrepancy_in_margins

@@ -269,7 +269,7 @@ class LocalModel:
         if self.problem.error is None or self.scales.discrepancy >= 1.0:
             return covariance
         whole = self.eta.copy()
-        whole[DISCREPANCY] = 0.0
+        whole[DISCREPANCY] = np.log(self.scales.margin_discrepancy)
         held = self.precision**2 * np.exp(self.problem.prior_variances(whole)[0])
         believed, seen = (self._evidence.noise(each)[0] for each in (self.eta, whole))
         told = self._evidence.problem.weighted(np.exp(seen - 2.0 * believed))[0]

@@ -150,7 +150,7 @@ def uncertainty(
     """
     rest = np.zeros(len(problem.observed.body.points))
     if problem.error is not None:
-        rest = max(posterior.scales.discrepancy, 1.0) * problem.error.size * problem.error.discrepancy.rest
+        rest = posterior.scales.margin_discrepancy * problem.error.size * problem.error.discrepancy.rest
     if not np.isfinite(posterior.covariance).all():  # of a cloud that tells nothing that could be believed
         return Uncertainty(np.zeros((3 * len(rest), 1)), np.full(len(rest), np.inf))
     slopes, moving = _by_unknowns(problem, evaluation), np.ones(problem.size, dtype=bool)

@@ -199,7 +199,8 @@ def test_margins_are_those_of_an_estimate_that_believed_the_model_too_much(
     local = LocalModel(problem, evaluation, Square(), 1e-4, starts=[start], is_held=True)
     assert local.scales.discrepancy == pytest.approx(0.6)
 
-    believed = problem.hyperprior.median
+    believed = problem.hyperprior.median.copy()
+    believed[DISCREPANCY] = np.log(local.scales.margin_discrepancy)
     variances = np.exp(problem.prior_variances(believed)[0])
     unknown = np.sqrt(variances)[:, None] * rng.standard_normal((problem.size, 40_000))
     noise = np.hypot(local.noise, local.rough)[:, None] * rng.standard_normal((len(cloud), 40_000))
