@@ -134,14 +134,15 @@ def test_a_dense_cloud_promises_no_more_than_its_patches_allow(body: Body) -> No
 
     Noise of correlation exp(-d^2 / 2 s^2) is independent from one patch of 2 pi s^2 to the next: of the 0.32 m^2 seen
     there are some 57. So many points with noise of their own are the floor. Half of it (a quarter of the information)
-    is let pass: forces have explained a part of what points share before that is looked at.
+    is let pass: forces have explained a part of what points share before that is looked at. Of so few points about half
+    of the clouds tell a state to 1 mm and half to 7 mm, so that the middle one is chance: means are compared.
     """
     length, count = 0.03, 50_000
     patches = round(2 * 0.8 * 0.2 / (2.0 * np.pi * length**2))
     dense, sparse = registrar(body, maximum_points=count), registrar(body)
     truth = sparse.model.solve(sparse.forces.forces(np.full(sparse.forces.size, 0.5 * FORCE))).displacement
     doubt: dict[str, list[float]] = {"floor": [], "shared": [], "dense": [], "believed": []}
-    for seed in range(20):  # of few points, what is told differs much from cloud to cloud
+    for seed in range(40):  # of few points, what is told differs much from cloud to cloud
         few = sparse.register(cloud_on(body, truth, patches, np.random.default_rng(seed), NOISE))
         doubt["floor"].append(float(few.uncertainty.deviation.mean()))
     for seed in range(3):
@@ -154,8 +155,8 @@ def test_a_dense_cloud_promises_no_more_than_its_patches_allow(body: Body) -> No
         believed = dense.register(cloud + NOISE * rng.standard_normal(cloud.shape))
         doubt["believed"].append(float(believed.uncertainty.deviation.mean()))
     assert np.median(doubt["shared"]) > 0.5 * NOISE
-    assert np.median(doubt["dense"]) > 0.5 * np.median(doubt["floor"])
-    assert np.median(doubt["believed"]) < 0.2 * np.median(doubt["floor"])  # noise of their own is told from it
+    assert np.mean(doubt["dense"]) > 0.5 * np.mean(doubt["floor"])
+    assert np.mean(doubt["believed"]) < 0.2 * np.mean(doubt["floor"])  # noise of their own is told from it
 
 
 def smooth_field(points: np.ndarray, length: float, rng: np.random.Generator) -> np.ndarray:
