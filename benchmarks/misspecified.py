@@ -55,9 +55,11 @@ ENGINES: dict[str, dict[str, Any]] = {
 _LINEAR = "linear reference"
 
 
-def moved(body: Body, material: NeoHookean, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """A state under one random pull, (n, 3), and the net force, (3,)."""
-    seen = np.setdiff1d(np.unique(body.surfaces["observed"]), body.fixed)
+def moved(
+    body: Body, material: NeoHookean, rng: np.random.Generator, nodes: NDArray[np.int64] | None = None
+) -> tuple[Floats, Floats]:
+    """A state under one random pull at some nodes, (n, 3), and the net force, (3,); at those seen if none are given."""
+    seen = np.setdiff1d(np.unique(body.surfaces["observed"]) if nodes is None else nodes, body.fixed)
     far = np.linalg.norm(body.points[seen][:, None] - body.points[body.fixed][None], axis=2).min(axis=1)
     middle = body.points[rng.choice(seen[far > 0.04])]
     shares = np.exp(-0.5 * ((body.points[seen] - middle) ** 2).sum(axis=1) / PATCH**2)
@@ -84,14 +86,16 @@ def other_ratio(body: Body, rng: np.random.Generator) -> tuple[Floats, Floats]:
     return moved(body, NeoHookean(MODULUS, rng.uniform(0.45, 0.49)), rng)
 
 
-def held_elsewhere(body: Body, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """What holds the organ lies up to 10 mm beside where the twin has it."""
+def held_elsewhere(
+    body: Body, rng: np.random.Generator, least: float = 0.0, most: float = 0.01
+) -> tuple[Floats, Floats]:
+    """What holds the organ lies up to 10 mm, or from so far to so far, beside where the twin has it, metres."""
     places = body.points[body.fixed]
     middle = places.mean(axis=0)
     radius = np.linalg.norm(places - middle, axis=1).max()
     while True:
         shift = rng.standard_normal(3)
-        shift *= rng.uniform(0.0, 0.01) / np.linalg.norm(shift)
+        shift *= rng.uniform(least, most) / np.linalg.norm(shift)
         away = np.linalg.norm(body.points[body.boundary_nodes] - middle - shift, axis=1)
         nodes = body.boundary_nodes[away <= radius]
         if len(nodes) >= 6:
