@@ -27,7 +27,8 @@ class Way(Enum):
 
 # What an extra is for, and what single packages are for that leave the rest usable when they are absent.
 EXTRAS = {
-    "": "the core: bodies, data sets, registration with a forward model of your own",
+    "": "the core: bodies, finished twins, registration with a forward model of your own",
+    "data": "data sets of samples as Zarr folders",
     "torch": "surrogates: training, prediction and registration with them",
     "mesh": "tetrahedra inside of surfaces and segmentations, softtwin mesh",
     "onnx": "surrogates as graphs for other programs, softtwin export",
@@ -47,6 +48,7 @@ PACKAGES = {
     "pyigtl": "clouds from and results to 3D Slicer by OpenIGTLink",
     "lightning": "training of surrogates",
     "tensorboardX": "logs of a training for TensorBoard",
+    "zarr": "data sets of samples: making them, training on them, looking into them",
     "safetensors": "reading and writing of a twin's weights",
 }
 
