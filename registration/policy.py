@@ -93,10 +93,16 @@ class Policy:
         "robustness, surrogate: noise 5 mm (0.35, 0.5, 1.0: 0.52, 0.54, 0.64 mm)",
     )
     force_spread_anywhere: float = choice(
-        0.2,
+        0.7,
         "",
-        "the same of a model that errs, where no zone is told: forces anywhere explain what it gets wrong",
-        "robustness, surrogate: no zone, clean (0.2, 0.35, 1.0: 0.24, 0.31, 0.50 mm)",
+        "the same of a model that errs, where no zone is told: forces gathered at a small place are larger",
+        "misspecified, as it is (0.2, 0.35, 0.7: 0.20, 0.18, 0.16 mm)",
+    )
+    force_elsewhere: float = choice(
+        0.005,
+        "of the size at the place where forces were found",
+        "size of forces elsewhere, where no zone is told: large ones at the place would make them free everywhere",
+        "robustness, surrogate: no zone, clean (0.02, 0.005, 0.001: 0.41, 0.23, 0.23 mm)",
     )
 
 

@@ -219,7 +219,9 @@ def _parted_net(parts: Floats, patterns: Floats) -> Floats:
     return axes @ patterns
 
 
-def contact(forces: NodalForces, nodal: Floats, positions: Floats, reach: float, minimum: float = 0.02) -> Floats:
+def contact(
+    forces: NodalForces, nodal: Floats, positions: Floats, reach: float, minimum: float = POLICY.force_elsewhere
+) -> Floats:
     """Where forces were found, as parts of the largest, (n,): the next prior of forces whose place is unknown.
 
     Repeated, forces gather where the cloud asks for them (re-weighted least squares: Gorodnitsky and Rao 1997).
