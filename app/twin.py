@@ -276,11 +276,6 @@ class Twin:
         """
         return TwinWays(self, zone, camera or self.as_said, until, landmarks)
 
-    @property
-    def is_concurrent(self) -> bool:
-        """Whether clouds can be registered in two threads at a time."""
-        return isinstance(self.registrar(), Registrar) and bool(getattr(self.model, "is_concurrent", False))
-
     def _marked(
         self, registrar: Engine, landmarks: Landmarks | None, deviation: float | None, camera: Camera
     ) -> Engine:
@@ -547,9 +542,10 @@ class Sequence:
 
     def __init__(self, twin: Twin, zone: str | None = None, camera: Camera = None, *, is_live: bool = False) -> None:
         self.twin, self.zone, self.camera = twin, zone, camera
-        self._tracker = Tracker(background=is_live and twin.is_concurrent)
         self._count = 0
-        twin.registrar(zone)  # a zone that is not there is said before the first cloud
+        engine = twin.registrar(zone)  # a zone that is not there is said before the first cloud
+        is_concurrent = isinstance(engine, Registrar) and bool(getattr(engine.model, "is_concurrent", False))
+        self._tracker = Tracker(background=is_live and is_concurrent)
 
     def register(self, cloud: ArrayLike, until: float = np.inf, landmarks: Landmarks | None = None) -> Frame:
         """The next frame; refused, with the reason, where the cloud cannot be registered.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 _LENGTHS, _SIZES = 5, 40  # of noise that neighbours share, from the least to the largest
-_FIRST = 20  # of its modes are asked first: of 60 clouds with noise of 2 mm, all 19 that show some are found by these
+_FIRST = 20  # of its modes are asked first
 _HOPED = 0.25  # of what is believed against it that these have to promise
 
 

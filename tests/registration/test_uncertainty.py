@@ -134,8 +134,8 @@ def test_a_dense_cloud_promises_no_more_than_its_patches_allow(body: Body) -> No
 
     Noise of correlation exp(-d^2 / 2 s^2) is independent from one patch of 2 pi s^2 to the next: of the 0.32 m^2 seen
     there are some 57. So many points with noise of their own are the floor. Half of it (a quarter of the information)
-    is let pass: forces have explained a part of what points share before that is looked at. Of so few points about half
-    of the clouds tell a state to 1 mm and half to 7 mm, so that the middle one is chance: means are compared.
+    is let pass: forces have explained a part of what points share before that is looked at. Of so few points
+    some clouds tell a state well and as many badly, so that the middle one is chance: means are compared.
     """
     length, count = 0.03, 50_000
     patches = round(2 * 0.8 * 0.2 / (2.0 * np.pi * length**2))
