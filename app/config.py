@@ -12,8 +12,8 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from softtwin.meshes.attachment import parse_file
 from softtwin.meshes.io import SEGMENTATIONS, Axes
 
-from .parameters import WORDS as PARAMETERS
 from .parameters import NamedParameter
+from .parameters import words as words_of_parameters
 from .schema import ConfigError as ConfigError
 from .schema import Section, described, option, option_of, part
 
@@ -341,7 +341,7 @@ class RegistrationSection(Section):
     )
     parameters: tuple[str, ...] = option(
         (),
-        f"parameter to estimate beside the forces: {PARAMETERS}",
+        f"parameter to estimate beside the forces: {words_of_parameters()}",
         group="parameters",
         flag="--parameter",
         old=("unknowns", "unknown"),
@@ -416,11 +416,11 @@ class RegistrationSection(Section):
 
     @model_validator(mode="after")
     def _parameters_can_be_found(self) -> RegistrationSection:
-        kinds = [NamedParameter.parse(text).kind for text in self.parameters]
-        others = set(kinds) - {"contact"}
+        named = [NamedParameter.parse(text) for text in self.parameters]
+        kinds, others = [each.kind for each in named], [each for each in named if each.is_input]
         if "contact" in kinds and len(kinds) > 1:
             raise ValueError(f"registration.parameters: expected contact alone, got {', '.join(self.parameters)}")
-        models = ["surrogate", "reference"] if kinds and not others else ["surrogate", "reference", "hybrid"]
+        models = ["surrogate", "reference"] if "contact" in kinds else ["surrogate", "reference", "hybrid"]
         if others:  # a network has learned one material
             models = ["reference", "hybrid"]
         if self.known_forces:  # they are added to those that the network is asked for, where both engines know of them

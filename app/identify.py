@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from softtwin.meshes.io import Unit
-from softtwin.registration.parameter_blocks import Estimate
+from softtwin.registration.parameters.block import Estimate
 from softtwin.registration.result import Registration
 
 from .export import WRITTEN, Exporter
@@ -76,12 +76,12 @@ def together(found: Sequence[Registration]) -> tuple[Estimate, ...]:
     """
     if not found:
         return ()
-    parameter_blocks, part = found[0].problem.parameter_blocks, found[0].problem.parameter_part
-    assert parameter_blocks is not None
-    precision, pulled = (1.0 - len(found)) * np.eye(parameter_blocks.count), np.zeros(parameter_blocks.count)
+    input_blocks, part = found[0].problem.inputs, found[0].problem.input_part
+    assert input_blocks is not None
+    precision, pulled = (1.0 - len(found)) * np.eye(input_blocks.size), np.zeros(input_blocks.size)
     for result in found:
         known = np.linalg.inv(result.posterior.covariance[part, part])
         precision += known
         pulled += known @ result.coefficients[part]
     covariance = np.linalg.inv(precision)
-    return parameter_blocks.estimates(covariance @ pulled, covariance)
+    return input_blocks.estimates(covariance @ pulled, covariance)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.io import RAS_TO_LPS, FileError
 from softtwin.meshes.io.landmarks import SUFFIXES, read_named_points
-from softtwin.registration.landmarks import LandmarkPairs
 from softtwin.registration.pose import LandmarkFit, from_landmarks
+from softtwin.registration.residuals.landmarks import LandmarkPairs
 
 from .config import ConfigError
 from .record import millimetres

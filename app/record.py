@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.metrics import target_errors
-from softtwin.registration.parameter_blocks import WITHIN_90
+from softtwin.registration.parameters.block import WITHIN_90
 from softtwin.registration.pose import Pose
 from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Verdict

@@ -21,8 +21,8 @@ from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.io import Axes, ContentError, FileError, Unit, is_companion, read_points
 from softtwin.meshes.io.clouds import TABLES
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose, read_matrix
-from softtwin.registration.priors import PosePrior
 
 from . import twin as twins
 from .arguments import RegisterArguments

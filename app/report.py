@@ -25,7 +25,7 @@ from softtwin.meshes.embedding import Embedding, carried, outer, target_points
 from softtwin.meshes.io import read_body
 from softtwin.meshes.metrics import mesh_quality, nodal_errors
 from softtwin.reference.data.dataset import SPLITS, DataSet
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 
 from .config import Config, to_toml
 from .pictures import (

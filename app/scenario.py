@@ -12,7 +12,9 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.export import Coordinates
 from softtwin.reference.data.loading import Loading
 from softtwin.registration.contact import Patch
-from softtwin.registration.parameter_blocks import ParameterBlocks
+from softtwin.registration.parameters.block import ParameterBlock
+from softtwin.registration.parameters.inputs import InputBlocks
+from softtwin.registration.surface_distance import SurfaceDistance
 
 from .config import Config
 from .parameters import NamedParameter, ParameterError
@@ -104,8 +106,8 @@ class Scenario:
         found[body.fixed] = 0.0
         return found
 
-    def parameter_blocks(self, body: Body, modulus: float, ratio: float) -> ParameterBlocks | None:
-        """The parameters as registration takes them; None where there are none.
+    def inputs(self, body: Body, modulus: float, ratio: float) -> InputBlocks | None:
+        """The unknown inputs of the model; None where there are none.
 
         Args:
             body: the body.
@@ -115,8 +117,16 @@ class Scenario:
         Raises:
             ValueError: no such structure or node set, or each named twice.
         """
-        named = [parameter for parameter in self.parameters if parameter.kind != "contact"]
-        if not named:
-            return None
+        made = [parameter.input_block(body) for parameter in self.parameters]
+        blocks = tuple(block for block in made if block is not None)
         values = {"young_modulus": self.modulus(modulus, body), "poisson_ratio": ratio}
-        return ParameterBlocks(body, values, tuple(parameter.parameter_block(body) for parameter in named))
+        return InputBlocks(body, values, blocks) if blocks else None
+
+    def blocks(self, observed: SurfaceDistance) -> tuple[ParameterBlock, ...]:
+        """Parameters that are no inputs of the model.
+
+        Args:
+            observed: the observed side.
+        """
+        made = [parameter.block(observed) for parameter in self.parameters]
+        return tuple(block for block in made if block is not None)

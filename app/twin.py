@@ -27,17 +27,18 @@ from softtwin.registration.contact import ContactRegistrar
 from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.hyperparameters import LogNormalPrior
-from softtwin.registration.landmarks import LandmarkPairs
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.options import NOISE, RegistrationOptions, expected_force, options_for
-from softtwin.registration.parameter_blocks import ParameterBlocks
+from softtwin.registration.parameters.inputs import InputBlocks
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.penalties import PENALTIES
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import PosePrior
 from softtwin.registration.registrar import Registrar, prepare
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.residuals.landmarks import LandmarkPairs
+from softtwin.registration.residuals.term import ResidualTerm
 from softtwin.registration.result import Registration
 from softtwin.registration.rigid import align
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.tracker import Tracker
 from softtwin.registration.verdict import Judgement, Verdict
 
@@ -233,6 +234,7 @@ class Twin:
         *,
         landmarks: Landmarks | None = None,
         landmark_deviation: float | None = None,
+        terms: tuple[ResidualTerm, ...] = (),
     ) -> Registration:
         """The forces and the state that explain a cloud, with a verdict on them.
 
@@ -246,6 +248,7 @@ class Twin:
                 coordinates, (l, 3) each, metres: they pull beside the cloud.
             landmark_deviation: standard deviation of each coordinate of where they were found, metres; what the
                 configuration says if not given.
+            terms: other measurements that pull beside the cloud, in the coordinates that it is brought to.
 
         Raises:
             ConfigError: no such zone; landmarks beside a contact of unknown place.
@@ -258,7 +261,7 @@ class Twin:
         camera = camera or self.as_said
 
         def run(registrar: Engine, points: Floats) -> Registration:
-            return self._marked(registrar, landmarks, landmark_deviation, camera).register(points, start)
+            return self._measured(registrar, landmarks, landmark_deviation, camera, terms).register(points, start)
 
         return self._posed_result(cloud, zone, camera, run)
 
@@ -276,18 +279,24 @@ class Twin:
         """
         return TwinWays(self, zone, camera or self.as_said, until, landmarks)
 
-    def _marked(
-        self, registrar: Engine, landmarks: Landmarks | None, deviation: float | None, camera: Camera
+    def _measured(
+        self,
+        registrar: Engine,
+        landmarks: Landmarks | None,
+        deviation: float | None,
+        camera: Camera,
+        terms: tuple[ResidualTerm, ...] = (),
     ) -> Engine:
-        """What registers with landmarks beside the cloud; as it is where there are none."""
+        """What registers with landmarks and other terms beside the cloud; as it is where there are none."""
         if landmarks is None:
-            return registrar
+            return _takes_marks(registrar).with_terms(*terms) if terms else registrar
         registrar = _takes_marks(registrar)
         places = np.asarray(landmarks[1], dtype=np.float64)
         if isinstance(camera, Pose) and places.ndim == 2 and places.shape[1] == 3:
             places = camera.inverse().apply(places)
         wide = self.config.registration.landmark_deviation if deviation is None else deviation
-        return registrar.with_landmarks(LandmarkPairs.of(registrar.observed, landmarks[0], places, wide))
+        marks = LandmarkPairs.of(registrar.observed, landmarks[0], places, wide)
+        return registrar.with_terms(marks, *terms)
 
     @property
     def observed(self) -> SurfaceDistance:
@@ -450,13 +459,13 @@ class Twin:
             return ContactRegistrar(exact, patch)
         return exact if self._fast is None else HybridRegistrar(self._alone(self._fast, zone), exact)
 
-    def _conditions(self, model: ForwardModel) -> ParameterBlocks | None:
-        """Unknowns beside the forces, for the model that takes them."""
+    def _inputs(self, model: ForwardModel) -> InputBlocks | None:
+        """Unknown inputs beside the forces, for the model that takes them."""
         if model is self._fast:
             return None
         material = self.config.material
         try:
-            return Scenario.of(self.config).parameter_blocks(self.body, material.young_modulus, material.poisson_ratio)
+            return Scenario.of(self.config).inputs(self.body, material.young_modulus, material.poisson_ratio)
         except ValueError as error:
             raise ConfigError(f"registration.parameters: {error}") from None
 
@@ -466,8 +475,8 @@ class Twin:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
         loaded = loaded_nodes(body, load_plan(self.config))
         nodes = None if section.forces == "known" else body.node_sets[zone] if zone else loaded
-        parameter_blocks = self._conditions(model)
-        if nodes is not None and parameter_blocks is not None and not len(np.setdiff1d(nodes, parameter_blocks.moved)):
+        inputs = self._inputs(model)
+        if nodes is not None and inputs is not None and not len(np.setdiff1d(nodes, inputs.moved_nodes)):
             raise ConfigError(
                 f"registration.zone: expected nodes that may carry force, got {zone or 'loaded nodes'}, all of which "
                 "moved@ holds; what is moved carries none. Give another zone."
@@ -480,7 +489,8 @@ class Twin:
             smoothness=section.smoothness,
             directions=section.directions,
             options=_options(section, options_for(model, bool(zone))),
-            parameter_blocks=parameter_blocks,
+            inputs=inputs,
+            blocks=Scenario.of(self.config).blocks,
             modulus_deviation=self.config.material.young_modulus_deviation,
             elsewhere=loaded if zone else None,
         )
@@ -519,7 +529,7 @@ class TwinWays:
             limited = registrar.limited(self.until) if self.until < np.inf else registrar
             if self.before_step is not None:
                 limited = _registrar(registrar).beside(self.before_step)
-            return follow(self.twin._marked(limited, self.landmarks, None, self.camera), points)
+            return follow(self.twin._measured(limited, self.landmarks, None, self.camera), points)
 
         return self.twin._posed_result(cloud, self.zone, self.camera, run)
 

@@ -44,8 +44,8 @@ from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import expected_force, options_for
 from softtwin.registration.problem import Problem as Search
 from softtwin.registration.registrar import prepare
-from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.result import Registration
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.surrogate.discrepancy import with_discrepancy
 from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.model import Surrogate

@@ -41,7 +41,7 @@ from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.solve.problem import Problem
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import options_for
-from softtwin.registration.priors import nodal_forces
+from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.registrar import prepare
 from softtwin.registration.verdict import Verdict
 from softtwin.surrogate.model import Surrogate

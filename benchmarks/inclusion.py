@@ -32,7 +32,10 @@ from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 from softtwin.registration.options import expected_force, options_for
-from softtwin.registration.parameter_blocks import WITHIN_90, Estimate, ParameterBlocks, PoissonRatio, YoungModulus
+from softtwin.registration.parameters.block import WITHIN_90, Estimate
+from softtwin.registration.parameters.inputs import InputBlocks
+from softtwin.registration.parameters.poisson_ratio import PoissonRatio
+from softtwin.registration.parameters.young_modulus import YoungModulus
 from softtwin.registration.registrar import prepare
 from softtwin.registration.result import Registration
 
@@ -75,15 +78,15 @@ def drawn(
 
 
 def registered(
-    body: Body, cloud: Floats, zone: Ints | None, parameter_blocks: ParameterBlocks, known: Floats | None = None
+    body: Body, cloud: Floats, zone: Ints | None, input_blocks: InputBlocks, known: Floats | None = None
 ) -> Registration:
     """The cloud, with forces in a zone, or with all of them known."""
-    with Problem(body, NeoHookean(**parameter_blocks.parameters), SEARCH) as problem:
+    with Problem(body, NeoHookean(**input_blocks.parameters), SEARCH) as problem:
         model = ReferenceModel(problem, patient=False, loading=Loading(forces=known))
         scale = expected_force(body, MODULUS)
         registrar = prepare(
             model, zone, body.surfaces["observed"], force_scale=scale, options=options_for(model, zone is not None),
-            parameter_blocks=parameter_blocks,
+            inputs=input_blocks,
         )  # fmt: skip
         return told(registrar.register(cloud))
 
@@ -115,11 +118,11 @@ def force_over_modulus(body: Body, seed: int) -> dict[str, Any]:
     """Forces, E and nu unknown: force / E against the truth's."""
     rng = np.random.default_rng([seed, 0])
     prior = YoungModulus(KNOWN), PoissonRatio(0.5)
-    parameter_blocks = ParameterBlocks(body, {"young_modulus": MODULUS, "poisson_ratio": RATIO}, prior)
-    material = parameter_blocks.inputs(rng.standard_normal(2)).parameters
+    input_blocks = InputBlocks(body, {"young_modulus": MODULUS, "poisson_ratio": RATIO}, prior)
+    material = input_blocks.inputs(rng.standard_normal(2)).parameters
     modulus, ratio = float(np.mean(material["young_modulus"])), float(np.mean(material["poisson_ratio"]))
     forces, zone, truth, cloud = drawn(body, modulus, ratio, seed)
-    found = registered(body, cloud, zone, parameter_blocks)
+    found = registered(body, cloud, zone, input_blocks)
     row = figures(found, truth, {"Young's modulus": modulus, "Poisson's ratio": ratio})
     assert found.force_over_modulus is not None
     for name, value, doubt, true in (
@@ -139,11 +142,11 @@ def inclusion(body: Body, seed: int, is_known: bool, clouds: int = 1) -> dict[st
     moduli = np.full(len(body.cells), rest)
     moduli[region] *= times
     parameters = {"young_modulus": np.full(len(body.cells), MODULUS), "poisson_ratio": RATIO}
-    parameter_blocks = ParameterBlocks(body, parameters, (YoungModulus(KNOWN), YoungModulus(1.0, region, "tumour")))
+    input_blocks = InputBlocks(body, parameters, (YoungModulus(KNOWN), YoungModulus(1.0, region, "tumour")))
     true, rows, found = {"Young's modulus": rest, "Young's modulus of tumour": rest * times}, [], []
     for number in range(clouds):
         forces, zone, truth, cloud = drawn(body, moduli, RATIO, FURTHER * number + seed, "tumour")
-        result = registered(body, cloud, None if is_known else zone, parameter_blocks, forces if is_known else None)
+        result = registered(body, cloud, None if is_known else zone, input_blocks, forces if is_known else None)
         found.append(result)
         rows.append(figures(result, truth, true))
     worst = max(rows, key=lambda row: ("accepted", "doubtful", "refused").index(row["verdict"]))

@@ -40,11 +40,14 @@ from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.loss import Square
 from softtwin.registration.options import NOISE, expected_force
-from softtwin.registration.parameter_blocks import ParameterBlock, ParameterBlocks, PoissonRatio, YoungModulus
-from softtwin.registration.priors import known_forces, nodal_forces
+from softtwin.registration.parameters.input_block import InputBlock
+from softtwin.registration.parameters.inputs import InputBlocks
+from softtwin.registration.parameters.nodal_forces import known_forces, nodal_forces
+from softtwin.registration.parameters.poisson_ratio import PoissonRatio
+from softtwin.registration.parameters.young_modulus import YoungModulus
 from softtwin.registration.problem import Problem as Search
 from softtwin.registration.registrar import prepare
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Verdict
 from softtwin.surrogate.residual import ElasticBody
 
@@ -231,7 +234,7 @@ def force(body: Body, count: int) -> dict[str, Any]:
             begun = -forces[unknown.nodes].ravel() if place % 2 == 0 else 1e-2 * rng.standard_normal(unknown.size)
             clock = time.perf_counter()
             try:
-                search = Search(reduced, observed, unknown, None, cloud, NOISE)
+                search = Search.of(reduced, observed, cloud, NOISE, (unknown,))
                 ended = GaussNewton().solve(search, begun)
                 solved = ended.evaluations
                 if ended.evaluation.match.rms > _LEFT:  # as `Registrar.follow` does where a start leads astray
@@ -292,7 +295,7 @@ def force(body: Body, count: int) -> dict[str, Any]:
 
 
 def controlled(
-    body: Body, count: int, unknowns: tuple[ParameterBlock, ...], starts: list[dict[str, float]]
+    body: Body, count: int, unknowns: tuple[InputBlock, ...], starts: list[dict[str, float]]
 ) -> tuple[list[dict[str, float]], list[int], list[float]]:
     """Material parameters found from clouds under known forces: what they are off, what failed, seconds."""
     rows, failed, spent = [], [], []
@@ -303,20 +306,18 @@ def controlled(
             truth = ReferenceModel(problem).solve(forces).displacement
             cloud = cloud_of(body, truth, np.random.default_rng(number))
             model = ReferenceModel(problem, patient=True, loading=Loading(forces=forces))
-            parameter_blocks = ParameterBlocks(body, start, unknowns)
+            input_blocks = InputBlocks(body, start, unknowns)
             none = known_forces(body, LogNormalPrior(1.0, 0.0))
-            search = Search(
-                reduce_model(model, observed.nodes, none.basis, parameter_blocks), observed, none, None, cloud, EXACT,
-                parameter_blocks=parameter_blocks,
-            )  # fmt: skip
+            reduced = reduce_model(model, observed.nodes, none.basis, input_blocks)
+            search = Search.of(reduced, observed, cloud, EXACT, (none, input_blocks))
             clock = time.perf_counter()
             try:
-                ended = SOLVER.solve(search, np.zeros(parameter_blocks.count))
+                ended = SOLVER.solve(search, np.zeros(input_blocks.size))
             except NotConverged:
                 failed.append(number)
                 continue
             spent.append(time.perf_counter() - clock)
-            inputs = parameter_blocks.inputs(ended.evaluation.coefficients).parameters
+            inputs = input_blocks.inputs(ended.evaluation.coefficients).parameters
             row = distances(ended.evaluation.state.full.displacement, truth)
             row["modulus_off"] = abs(float(inputs["young_modulus"]) / MODULUS - 1.0)
             row["ratio_off"] = abs(float(inputs["poisson_ratio"]) / RATIO - 1.0)

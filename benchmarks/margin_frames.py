@@ -46,8 +46,8 @@ from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.solve.problem import Problem
 from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.pose import Pose, from_landmarks
-from softtwin.registration.priors import nodal_forces
 from softtwin.registration.uncertainty import Uncertainty
 from softtwin.registration.verdict import Verdict
 

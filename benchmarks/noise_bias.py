@@ -16,7 +16,7 @@ from liver import SEQUENCES, sequence
 from robustness import forward_model, noisy, registrar_for
 
 from softtwin.registration.loss import Tukey
-from softtwin.registration.residuals import expected_distance
+from softtwin.registration.surface_distance import expected_distance
 
 EXPECTED_N = 0.05
 NOISES_MM = (1.0, 2.0, 5.0)

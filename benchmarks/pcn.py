@@ -30,8 +30,10 @@ from numpy.typing import NDArray
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS
 from softtwin.app.twin import Twin
 from softtwin.meshes.clouds import partial_view
+from softtwin.registration.evaluation import Evaluation
 from softtwin.registration.loss import Loss, Tukey
-from softtwin.registration.problem import Evaluation, Problem
+from softtwin.registration.parameters.discrepancy import ModelError
+from softtwin.registration.problem import Problem
 from softtwin.registration.result import Registration
 
 Floats = NDArray[np.float64]
@@ -96,7 +98,7 @@ class Law:
         forces = found[problem.force_part]
         moved = problem.model.solve(forces).full.displacement
         if problem.error is not None:
-            moved = moved + problem.error.field(found[problem.error_part])
+            moved = moved + problem.error.field(found[problem.part(ModelError)])
         return np.concatenate([problem.forces.net_basis @ forces, moved.mean(axis=0)])
 
     def slopes(self) -> Floats:
@@ -106,8 +108,8 @@ class Law:
         mean = np.zeros((3, problem.size))  # what the patterns leave out, and noise, move no node
         mean[:, problem.force_part] = pushed.reshape(-1, 3, pushed.shape[1]).mean(axis=0)
         if problem.error is not None:
-            modes = problem.error.size * problem.error.discrepancy.modes
-            mean[:, problem.error_part] = modes.reshape(-1, 3, modes.shape[1]).mean(axis=0)
+            modes = problem.error.amplitude * problem.error.modes
+            mean[:, problem.part(ModelError)] = modes.reshape(-1, 3, modes.shape[1]).mean(axis=0)
         return np.vstack([problem.net_forces(self.evaluation), mean]) * self.scale
 
 

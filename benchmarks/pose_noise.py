@@ -28,8 +28,8 @@ from summaries import counts, covered
 
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.forward import ForwardModel
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import PosePrior
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.result import Registration
 

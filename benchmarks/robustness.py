@@ -29,8 +29,8 @@ from softtwin.meshes.shapes import liver_phantom
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.options import expected_force, options_for
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import PosePrior
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.result import Registration
 

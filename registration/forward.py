@@ -11,11 +11,34 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
-
-from .parameter_blocks import ParameterBlocks
+from softtwin.reference.data.inputs import Change, Inputs
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+class UnknownInputs(Protocol):
+    """Inputs of a model beside nodal forces, as a function of coefficients: see `parameters.inputs.InputBlocks`."""
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients, c."""
+
+    @property
+    def has_forces_alone(self) -> bool:
+        """Whether nodal forces are all that they change."""
+
+    def inputs(self, coefficients: Floats) -> Inputs:
+        """The inputs at coefficients, (c,)."""
+
+    def changes(self, coefficients: Floats) -> list[Change]:
+        """Derivative of the inputs by each coefficient."""
+
+    def forces(self, coefficients: Floats) -> Floats:
+        """Nodal forces among the inputs, (n, 3), newtons."""
+
+    def stiffness_scaling(self, coefficients: Floats) -> tuple[float, Floats]:
+        """Factor by which other forces grow with the body's stiffness, and its derivative, (c,)."""
 
 
 class State(Protocol):
@@ -108,10 +131,10 @@ class ReducedState(Protocol):
 
 
 class ParametrisedState(ReducedState, Protocol):
-    """One that also depends on conditions: what the body is made of, and how it is moved."""
+    """One that also depends on inputs: what the body is made of, and how it is moved."""
 
     def by_parameters(self) -> Floats:
-        """Derivative of all nodes' displacement by the conditions' coefficients, (3n, c)."""
+        """Derivative of all nodes' displacement by the inputs' coefficients, (3n, c)."""
 
     def rows_by_parameters(self, rows: csr_array) -> Floats:
         """Derivative of linear functions of the chosen displacements, (q, c), for rows (q, 3p)."""
@@ -132,10 +155,10 @@ class ReducedModel(Protocol):
 
 
 class ParametrisedModel(ReducedModel, Protocol):
-    """One whose states also depend on conditions."""
+    """One whose states also depend on inputs."""
 
     def solve(self, coefficients: Floats, near: Any = None, unknown: Floats | None = None) -> ParametrisedState:
-        """The state for coefficients of forces, (k,), and of conditions, (c,)."""
+        """The state for coefficients of forces, (k,), and of inputs, (c,)."""
 
 
 class _PickedState:
@@ -163,14 +186,14 @@ class _PickedState:
         return self._basis_pushed.reshape(len(self.model.nodes), 3, len(change))[::every] @ change
 
     @cached_property
-    def _conditions_pushed(self) -> Floats:
-        parameter_blocks = self.model.parameter_blocks
-        assert parameter_blocks is not None
-        changes = parameter_blocks.changes(self.unknown)
+    def _inputs_pushed(self) -> Floats:
+        inputs = self.model.inputs
+        assert inputs is not None
+        changes = inputs.changes(self.unknown)
         forces, (_, slopes) = self.model.forces(self.coefficients), self.model.stiffness_scaling(self.unknown)
         for place in np.flatnonzero(slopes):
             changes[place] = replace(changes[place], forces=slopes[place] * forces)
-        if parameter_blocks.has_forces_alone:
+        if inputs.has_forces_alone:
             pushed: Floats = self.full.jvp(
                 np.stack([np.asarray(change.forces, dtype=np.float64).ravel() for change in changes], axis=1)
             )
@@ -179,10 +202,10 @@ class _PickedState:
         return pushed
 
     def by_parameters(self) -> Floats:
-        return self._conditions_pushed
+        return self._inputs_pushed
 
     def rows_by_parameters(self, rows: csr_array) -> Floats:
-        return rows @ self._conditions_pushed[self.model.rows]
+        return rows @ self._inputs_pushed[self.model.rows]
 
     def is_at(self, model: _PickedModel, coefficients: Floats, unknown: Floats) -> bool:
         """Whether it is the state of a model at coefficients."""
@@ -193,8 +216,8 @@ class _PickedState:
 class _PickedModel:
     """Any forward model, reduced by multiplying with the basis and picking rows."""
 
-    def __init__(self, model: Any, nodes: Ints, basis: Floats, parameter_blocks: ParameterBlocks | None) -> None:
-        self.model, self.nodes, self.basis, self.parameter_blocks = model, nodes, basis, parameter_blocks
+    def __init__(self, model: Any, nodes: Ints, basis: Floats, inputs: UnknownInputs | None) -> None:
+        self.model, self.nodes, self.basis, self.inputs = model, nodes, basis, inputs
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
 
     @property
@@ -207,32 +230,30 @@ class _PickedModel:
         return found
 
     def stiffness_scaling(self, unknown: Floats) -> tuple[float, Floats]:
-        """See `ParameterBlocks.stiffness_scaling`."""
-        return (1.0, np.zeros(0)) if self.parameter_blocks is None else self.parameter_blocks.stiffness_scaling(unknown)
+        """See `UnknownInputs.stiffness_scaling`."""
+        return (1.0, np.zeros(0)) if self.inputs is None else self.inputs.stiffness_scaling(unknown)
 
     def combined(self, matrix: Floats) -> _PickedModel:
-        return _PickedModel(self.model, self.nodes, self.basis @ matrix, self.parameter_blocks)
+        return _PickedModel(self.model, self.nodes, self.basis @ matrix, self.inputs)
 
     def solve(self, coefficients: Floats, near: ReducedState | None = None, unknown: Floats | None = None) -> Any:
-        """The state; conditions are as expected where no coefficients of theirs are given."""
+        """The state; inputs are as expected where no coefficients of theirs are given."""
         if unknown is None:
-            unknown = np.zeros(0 if self.parameter_blocks is None else self.parameter_blocks.count)
+            unknown = np.zeros(0 if self.inputs is None else self.inputs.size)
         if isinstance(near, _PickedState) and near.is_at(self, coefficients, unknown):
             return near
         forces = self.stiffness_scaling(unknown)[0] * self.forces(coefficients)
         start = None if near is None else near.full
-        if self.parameter_blocks is None:
+        if self.inputs is None:
             return _PickedState(self, coefficients, unknown, self.model.solve(forces, start))
-        if self.parameter_blocks.has_forces_alone:
-            full = self.model.solve(forces + self.parameter_blocks.forces(unknown), start)
+        if self.inputs.has_forces_alone:
+            full = self.model.solve(forces + self.inputs.forces(unknown), start)
         else:
-            full = self.model.solve(forces, start, self.parameter_blocks.inputs(unknown))
+            full = self.model.solve(forces, start, self.inputs.inputs(unknown))
         return _PickedState(self, coefficients, unknown, full)
 
 
-def reduce_model(
-    model: Any, nodes: Ints, basis: Floats, parameter_blocks: ParameterBlocks | None = None
-) -> ReducedModel:
+def reduce_model(model: Any, nodes: Ints, basis: Floats, inputs: UnknownInputs | None = None) -> ReducedModel:
     """A model from force coefficients to the displacement of some nodes.
 
     A model that has a `reduced` of its own (surrogates multiply beforehand) is asked for it.
@@ -241,17 +262,17 @@ def reduce_model(
         model: a forward model.
         nodes: numbers of the nodes whose displacement is wanted, (p,).
         basis: nodal forces of each coefficient, (3n, k), newtons.
-        parameter_blocks: unknowns beside the forces, which the model takes as inputs.
+        inputs: unknowns beside the forces, which the model takes as inputs.
 
     Raises:
         ValueError: the model was learned for one material and one support, and there are such unknowns.
     """
-    every_model_takes_them = parameter_blocks is not None and parameter_blocks.has_forces_alone
+    every_model_takes_them = inputs is not None and inputs.has_forces_alone
     if not hasattr(model, "reduced") or every_model_takes_them:
-        return _PickedModel(model, nodes, basis, parameter_blocks)
-    if parameter_blocks is not None:
+        return _PickedModel(model, nodes, basis, inputs)
+    if inputs is not None:
         raise ValueError(
-            "parameter_blocks: expected a model that takes parameters and prescribed displacements (the reference, or "
+            "inputs: expected a model that takes parameters and prescribed displacements (the reference, or "
             f"hybrid), got a {type(model).__name__}, which has learned one material and one support."
         )
     found: ReducedModel = model.reduced(nodes, basis)

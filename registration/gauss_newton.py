@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from softtwin.reference.data.outcome import NotConverged
 
+from .evaluation import Evaluation
 from .hyperparameters import LENGTH, SHARED
 from .local_model import LocalModel, without_shared_noise
 from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .posterior import Posterior
-from .problem import Evaluation, Problem
+from .problem import Problem
 from .score import gain_by_shared_noise
 
 Floats = NDArray[np.float64]

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from softtwin.reference.data.outcome import NotConverged
 
-from .landmarks import LandmarkPairs
 from .registrar import Registrar
-from .residuals import SurfaceDistance
+from .residuals.term import ResidualTerm
 from .result import Registration, badness
+from .surface_distance import SurfaceDistance
 from .verdict import Verdict
 
 
@@ -49,9 +49,9 @@ class HybridRegistrar:
         """
         return HybridRegistrar(self.fast.limited(until), self.exact.limited(until))
 
-    def with_landmarks(self, landmarks: LandmarkPairs | None) -> HybridRegistrar:
-        """The same with landmarks that pull beside the cloud, or without; see `Registrar.with_landmarks`."""
-        return HybridRegistrar(self.fast.with_landmarks(landmarks), self.exact.with_landmarks(landmarks))
+    def with_terms(self, *terms: ResidualTerm) -> HybridRegistrar:
+        """The same with other measurements that pull beside the cloud; see `Registrar.with_terms`."""
+        return HybridRegistrar(self.fast.with_terms(*terms), self.exact.with_terms(*terms))
 
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud; see `Registrar.register`.

@@ -12,14 +12,14 @@ from scipy.optimize import minimize
 
 from softtwin.reference.data.outcome import NotConverged
 
-from . import landmarks
+from .evaluation import Evaluation
 from .gauss_newton import IterationRecord, SolverResult
 from .hyperparameters import LENGTH, SHARED
 from .local_model import LocalModel, without_shared_noise
 from .loss import Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
 from .penalties import Penalty
-from .problem import Evaluation, Problem
+from .problem import Problem
 from .score import gain_by_shared_noise
 
 Floats = NDArray[np.float64]
@@ -182,11 +182,9 @@ def _objective(problem: Problem, evaluation: Evaluation, loss: Loss, local: Loca
     scaled = problem.residuals(evaluation, local.own) / local.deviations
     slope = loss.weight(scaled) * scaled / local.deviations
     value, gradient = float(loss.value(scaled).sum()), problem.vjp(evaluation, slope)
-    off, held = problem.landmark_residuals(evaluation), local.evaluation.match
-    leaning = problem.normal_residuals(evaluation, held)
-    value += float(landmarks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
-    if len(off):
-        gradient = gradient + problem.landmarks_vjp(evaluation, landmarks.LOSS.weight(off) * off)
-    if len(leaning):
-        gradient = gradient + problem.normals_vjp(evaluation, loss.weight(leaning) * leaning, held)
+    held = local.evaluation.match
+    for term in problem.terms:
+        off, cost = term.values(evaluation, held), term.loss or loss
+        value += float(cost.value(off).sum())
+        gradient = gradient + problem.vjp(evaluation, cost.weight(off) * off, term.slopes(evaluation, held))
     return value, gradient

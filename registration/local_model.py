@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from . import landmarks
+from .evaluation import Evaluation
 from .evidence import Evidence, LinearProblem
 from .hyperparameters import DISCREPANCY, LENGTH, NOISE, SHARED, Hyperparameters
 from .loss import Loss
 from .posterior import Posterior
-from .problem import Evaluation, Problem
+from .problem import Problem
+from .residuals.term import ResidualTerm
 
 Floats = NDArray[np.float64]
 _ALIKE = 0.02  # of all weights: what points tell is not summed anew for a smaller change of them
@@ -58,10 +59,9 @@ class LocalModel:
         self.linearised_at = evaluation if linearised_at is None else linearised_at
         self.was_whole, self.own = True, noise if own is None else own
         self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
-        off, leaning = problem.landmark_residuals(evaluation), problem.normal_residuals(evaluation)
-        by_marks, pull_by_marks = _told(off, landmarks.LOSS, lambda: problem.landmark_jacobian(evaluation))
-        by_normals, pull_by_normals = _told(leaning, loss, lambda: problem.normal_jacobian(evaluation))
-        self._known, self._beside = by_marks + by_normals, pull_by_marks + pull_by_normals
+        told = [_told(problem, evaluation, term, loss) for term in problem.terms]
+        self._known = np.sum([each[0] for each in told], axis=0) if told else None
+        self._beside: Floats | float = np.sum([each[1] for each in told], axis=0) if told else 0.0
         self._groups, self.rough = _grouped(problem.rough(evaluation))
         start = problem.hyperprior.within(starts[0]) if len(starts) else _believed(problem, noise)
         self.counted: Floats  # weights that what the points tell is summed with, (p,)
@@ -113,7 +113,7 @@ class LocalModel:
         data = self.jacobian @ coefficients - residuals
         root = np.sqrt(weights)
         parts = [root[group, None] * self.jacobian[group] for group in groups]
-        known = None if isinstance(self._known, float) else (self._known, self._known @ coefficients - self._beside)
+        known = None if self._known is None else (self._known, self._known @ coefficients - self._beside)
         linear = LinearProblem(
             np.stack([part.T @ part for part in parts]),
             np.stack([(root[group] * data[group]) @ part for group, part in zip(groups, parts, strict=True)]),
@@ -193,9 +193,10 @@ class LocalModel:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ evaluation.coefficients**2)
         scaled = self.problem.residuals(evaluation, self.own) / self.deviations
-        off = self.problem.landmark_residuals(evaluation)
-        leaning = self.problem.normal_residuals(evaluation, self.evaluation.match)
-        beside = float(landmarks.LOSS.value(off).sum()) + float(loss.value(leaning).sum())
+        held = self.evaluation.match
+        beside = sum(
+            float((term.loss or loss).value(term.values(evaluation, held)).sum()) for term in self.problem.terms
+        )
         return float(loss.value(scaled).sum()) + beside + prior
 
     @property
@@ -217,7 +218,7 @@ class LocalModel:
             other.__dict__.pop(name, None)
         residuals = self.problem.residuals(evaluation, self.own)
         other.evaluation, other.weights = evaluation, self.loss.weight(residuals / self.deviations)
-        if not isinstance(self._known, float):
+        if self._known is not None:
             other._beside = self._beside + self._known @ (evaluation.coefficients - self.evaluation.coefficients)
         other.gradient = other._gradient(residuals, other.weights)
         return other
@@ -254,7 +255,7 @@ class LocalModel:
         """Laplace's approximation at the trial, with what the doubt of the hyperparameters moves."""
         covariance = self._inverse
         shares = np.einsum("ij,ji->i", covariance, self._informed)
-        informed = float(shares[: self.problem.error_part.stop].sum())
+        informed = float(shares[self.problem.moving].sum())
         moved, spread = self._by_hyperparameters(covariance)
         covariance = self.error_covariance() + moved @ spread @ moved.T
         return Posterior(self.evaluation.coefficients, covariance, self.scales, informed)
@@ -320,19 +321,19 @@ def _grouped(rough: Floats) -> tuple[list[NDArray[np.int64]], Floats]:
     return groups, alike
 
 
-def _told(off: Floats, loss: Loss, jacobian: Callable[[], Floats]) -> tuple[Floats | float, Floats | float]:
+def _told(problem: Problem, evaluation: Evaluation, term: ResidualTerm, loss: Loss) -> tuple[Floats, Floats]:
     """Information, (k, k), and gradient, (k,), of what pulls beside the distances and carries its own deviation.
 
     The scales of noise and forces are found from the distances alone.
 
     Args:
-        off: residuals over their deviations, (r,); there may be none.
-        loss: of each.
-        jacobian: their derivative by the coefficients, (r, k).
+        problem: what is registered.
+        evaluation: where.
+        term: what pulls.
+        loss: of the points.
     """
-    if not len(off):
-        return 0.0, 0.0
-    slopes, weights = jacobian(), loss.weight(off)
+    off = term.values(evaluation)
+    slopes, weights = problem.jacobian(evaluation, term.slopes(evaluation)), (term.loss or loss).weight(off)
     return (weights[:, None] * slopes).T @ slopes, (weights * off) @ slopes
 
 

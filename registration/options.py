@@ -13,9 +13,9 @@ from .forward import ForwardModel
 from .gauss_newton import GaussNewton
 from .hyperparameters import LogNormalPrior
 from .lbfgs import LBFGS
-from .priors import LikelihoodInformed
-from .problem import NORMAL_DEVIATION
-from .residuals import Distance
+from .parameters.nodal_forces import LikelihoodInformed
+from .residuals.normals import NORMAL_DEVIATION
+from .surface_distance import Distance
 
 _SPREAD_ANYWHERE = (
     0.7  # of the logarithm of a nodal force, where a cloud tells the size of forces of which most are none

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
 
-from .priors import NodalForces
+from .parameters.nodal_forces import NodalForces
 
 Floats = NDArray[np.float64]
 Cost = Callable[[Floats], tuple[float, Floats]]

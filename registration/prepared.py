@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .forward import ForwardModel, ReducedModel, reduce_model
-from .parameter_blocks import ParameterBlocks
-from .priors import LikelihoodInformed, NodalForces, likelihood_informed
-from .residuals import SurfaceDistance
+from .parameters.inputs import InputBlocks
+from .parameters.nodal_forces import LikelihoodInformed, NodalForces, likelihood_informed
+from .surface_distance import SurfaceDistance
 from .uncertainty import unseen_response
 
 Floats = NDArray[np.float64]
@@ -35,10 +35,10 @@ class Prepared:
         model: ForwardModel,
         observed: SurfaceDistance,
         forces: NodalForces,
-        parameter_blocks: ParameterBlocks | None = None,
+        inputs: InputBlocks | None = None,
     ) -> Prepared:
         """What can be multiplied before a cloud comes."""
-        return cls(forces, reduce_model(model, observed.nodes, forces.basis, parameter_blocks))
+        return cls(forces, reduce_model(model, observed.nodes, forces.basis, inputs))
 
     def informed(self, observed: SurfaceDistance, rule: LikelihoodInformed) -> Prepared:
         """The directions that a cloud can tell: see `unknowns.likelihood_informed`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, reduce
@@ -15,34 +15,39 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.meshes.clouds import check_cloud
 from softtwin.reference.data.outcome import NotConverged
 
-from .checks import Expectations, judge, shared
+from .checks import judge, shared
 from .cloud import Cloud
+from .evaluation import Evaluation
+from .expectations import Expectations
 from .forward import ForwardModel, ReducedModel, reduce_model
 from .gauss_newton import GaussNewton, SolverResult
 from .hyperparameters import LogNormalPrior
-from .landmarks import LandmarkPairs
 from .lbfgs import LBFGS
 from .loss import robust_deviation
 from .manifold_mapping import ManifoldMapping
 from .options import RegistrationOptions
 from .outcome import Outcome
-from .parameter_blocks import ParameterBlocks
-from .policy import POLICY
-from .pose import Pose
-from .prepared import Prepared
-from .priors import (
+from .parameters.block import ParameterBlock
+from .parameters.correlated_noise import CorrelatedNoise
+from .parameters.discrepancy import ModelError
+from .parameters.inputs import InputBlocks
+from .parameters.nodal_forces import (
     LikelihoodInformed,
-    ModelError,
     NodalForces,
-    PosePrior,
     contact,
     known_forces,
     localised,
     nodal_forces,
 )
-from .problem import Evaluation, Problem
-from .residuals import SurfaceDistance
+from .parameters.pose import PosePrior
+from .policy import POLICY
+from .pose import Pose
+from .prepared import Prepared
+from .problem import Problem
+from .residuals.normals import Normals
+from .residuals.term import ResidualTerm
 from .result import Registration, badness
+from .surface_distance import SurfaceDistance
 from .tracker import Tracker
 from .verdict import Check, Code, Verdict
 
@@ -67,7 +72,8 @@ class Registrar:
         options: noise, solver, thinning, search for the place of the forces.
         pose: prior of the pose; None for clouds in the body's coordinates.
         expectations: what a usable result looks like; by the body's size and the noise if not given.
-        parameter_blocks: unknowns beside the forces, which the model takes; none if not given.
+        inputs: unknown inputs beside the forces, which the model takes; none if not given.
+        blocks: further parameters.
         modulus_deviation: of the logarithm of Young's modulus, where this is no unknown: forces found are the more in
             doubt by it. Under nodal forces alone states depend on forces over stiffness, and are not.
         anywhere: makes the same with forces anywhere, which is asked where neighbouring points are missed alike; None
@@ -86,20 +92,22 @@ class Registrar:
         *,
         pose: PosePrior | None = None,
         expectations: Expectations | None = None,
-        parameter_blocks: ParameterBlocks | None = None,
+        inputs: InputBlocks | None = None,
+        blocks: Sequence[ParameterBlock] = (),
         modulus_deviation: float = 0.0,
         anywhere: Callable[[], Registrar] | None = None,
     ) -> None:
         if not 0.0 <= modulus_deviation < np.inf:
             raise ValueError(f"Registrar.modulus_deviation: expected 0 or more, got {modulus_deviation}.")
         self.model, self.observed, self.forces, self.pose = model, observed, forces, pose
-        is_found = parameter_blocks is not None and parameter_blocks.modulus is not None
-        self.parameter_blocks, self.modulus_deviation = parameter_blocks, 0.0 if is_found else modulus_deviation
+        is_found = inputs is not None and inputs.modulus is not None
+        self.inputs, self.modulus_deviation = inputs, 0.0 if is_found else modulus_deviation
+        self.blocks = tuple(blocks)
         self.anywhere = None if anywhere is None else cache(anywhere)  # made when it is first asked for
-        self.landmarks: LandmarkPairs | None = None
+        self.terms: tuple[ResidualTerm, ...] = ()
         self.options = options or RegistrationOptions()
         discrepancy = model.discrepancy
-        self.error = None if discrepancy is None else ModelError.of(discrepancy, observed)
+        self.error = None if discrepancy is None else ModelError(discrepancy, observed)
         # Where it is not known what the model gets wrong, points tell no more than the model can meet.
         self.noise = self.options.noise.with_minimum(model.error)
         self._told = expectations
@@ -108,7 +116,7 @@ class Registrar:
         self._fast: list[tuple[ForwardModel, NodalForces, ReducedModel]] = []  # the last, which copies share
 
     def _prepared(self, forces: NodalForces) -> Prepared:
-        return Prepared.of(self.model, self.observed, forces, self.parameter_blocks)
+        return Prepared.of(self.model, self.observed, forces, self.inputs)
 
     def with_pose(self, pose: PosePrior, options: RegistrationOptions) -> Registrar:
         """The same with an unknown pose, and the options that suit it."""
@@ -120,7 +128,8 @@ class Registrar:
             options,
             pose=pose,
             expectations=self._told,
-            parameter_blocks=self.parameter_blocks,
+            inputs=self.inputs,
+            blocks=self.blocks,
             modulus_deviation=self.modulus_deviation,
             anywhere=None if anywhere is None else lambda: anywhere().with_pose(pose, options),
         )
@@ -131,14 +140,14 @@ class Registrar:
         other.options = replace(self.options, solver=replace(self.options.solver, until=until))
         return other
 
-    def with_landmarks(self, landmarks: LandmarkPairs | None) -> Registrar:
-        """The same with landmarks that pull beside the cloud, or without.
+    def with_terms(self, *terms: ResidualTerm) -> Registrar:
+        """The same with other measurements that pull beside the cloud, landmarks say, in place of those before.
 
         Args:
-            landmarks: of the same observed side; None for none.
+            terms: of the same observed side; normals come with the cloud.
         """
         other = copy.copy(self)
-        other.landmarks = landmarks
+        other.terms = terms
         return other
 
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
@@ -168,7 +177,7 @@ class Registrar:
         except ValueError:  # a network has learned no forces there
             return found
         with suppress(NotConverged):
-            other = anywhere.limited(self.options.solver.until).with_landmarks(self.landmarks).register(cloud)
+            other = anywhere.limited(self.options.solver.until).with_terms(*self.terms).register(cloud)
             if other.judgement.is_usable:
                 return found.with_check(_elsewhere(match.rms, other.evaluation.match.rms))
         return found
@@ -238,9 +247,8 @@ class Registrar:
         if self.options.localisation.rounds:
             prepared = self._prepared(replace(draft.prepared.forces, scale=self.forces.scale))
         problem = self._plain(points, prepared)
-        start = np.zeros(problem.size)
+        start = problem.carried(draft.coefficients, draft.problem)
         start[problem.force_part] = prepared.forces.nearest(draft.unknown_forces)
-        start[problem.pose_part] = draft.coefficients[draft.problem.pose_part]
         found = self._approached(problem, problem.begun(start, draft.evaluation), fast, solver, draft.eta)
         return self._finished(points, prepared, found, begin)
 
@@ -261,7 +269,7 @@ class Registrar:
         """
         spent: list[SolverResult] = []
         for _ in range(_ANCHORS):
-            if problem.parameter_blocks is not None or not isinstance(solver, GaussNewton):
+            if problem.inputs is not None or not isinstance(solver, GaussNewton):
                 break
             place = near.coefficients[problem.force_part]
             reduced = self._reduced(fast, problem.forces)
@@ -312,27 +320,24 @@ class Registrar:
 
     def _plain(self, points: Cloud, prepared: Prepared) -> Problem:
         """The problem with the model's error as the least noise."""
-        return Problem.seen(
-            points,
-            model=prepared.model,
-            observed=self.observed,
-            forces=prepared.forces,
-            pose=self.pose,
-            noise=self.noise,
-            parameter_blocks=self.parameter_blocks,
-            landmarks=self.landmarks,
-            normal_deviation=self.options.normal_deviation,
-            shared=self.observed.modes if self.options.correlated else None,
-        )
+        return self._posed(points, prepared, self.noise)
+
+    def _posed(
+        self, points: Cloud, prepared: Prepared, noise: LogNormalPrior, error: ModelError | None = None
+    ) -> Problem:
+        """The problem of a cloud: all blocks of parameters, and all that pulls."""
+        shared = CorrelatedNoise(self.observed.modes) if self.options.correlated else None
+        blocks = (prepared.forces, self.pose, self.inputs, error, *self.blocks, shared)
+        basis = points.tangent_basis
+        normals = None if basis is None else Normals(basis, self.options.normal_deviation)
+        return Problem.of(prepared.model, self.observed, points.points, noise, blocks, (*self.terms, normals))
 
     def _problem(self, points: Cloud, prepared: Prepared, near: SolverResult | Registration) -> Problem:
         """The problem with the model's error in patterns, of the size that belongs to a movement like a trial's."""
-        plain = self._plain(points, prepared)
         if self.error is None:
-            return plain
+            return self._plain(points, prepared)
         moved = np.linalg.norm(near.evaluation.positions, axis=1).max() + near.rms_distance
-        error = replace(self.error, size=float(moved))
-        return replace(plain, error=error, noise=self.options.noise)
+        return self._posed(points, prepared, self.options.noise, self.error.with_amplitude(float(moved)))
 
     def _cold(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
         """From rest; where the place of the forces is unknown, once more for each round of gathering them.
@@ -358,10 +363,8 @@ class Registrar:
         few, first = points.thinned(self.options.localisation.points), prepared.leading(_LEADING)
         rough, problem = self._plain(few, first).unshared, self._plain(points, prepared)
         begun = solver.rough().solve(rough, np.zeros(rough.size))
-        start = np.zeros(problem.size)
+        start = problem.carried(begun.evaluation.coefficients, rough)
         start[: first.forces.size] = begun.evaluation.coefficients[rough.force_part]
-        start[problem.pose_part] = begun.evaluation.coefficients[rough.pose_part]
-        start[problem.parameter_part] = begun.evaluation.coefficients[rough.parameter_part]
         if self._is_hopeless(begun):  # what six directions leave as far off is no state of this organ
             solver = solver.without_steps()
         return _after(begun, solver.solve(problem, start, begun.evaluation, begun.local.eta))
@@ -381,7 +384,7 @@ class Registrar:
             found = _after(found, solver.solve(problem, start, found.evaluation, found.local.eta))
         wider = self._believed(believed, found)
         if wider is not believed:  # seen only now that the model's error is told from noise
-            believed, problem = wider, replace(problem, forces=wider.forces)
+            believed, problem = wider, problem.with_forces(wider.forces)
             found = _after(
                 found, solver.solve(problem, found.evaluation.coefficients, found.evaluation, found.local.eta)
             )
@@ -500,7 +503,7 @@ class Registrar:
             informed=found.posterior.informed,
             points=len(problem.cloud),
             outcome=found.outcome,
-            judgement=judge(problem, found, state, self.expectations, discrepancy_scale),
+            judgement=judge(problem, found, state, self.expectations),
             evaluations=found.evaluations,
             seconds=time.perf_counter() - begin,
             trace=found.trace,
@@ -520,7 +523,8 @@ def prepare(
     directions: int = 64,
     options: RegistrationOptions | None = None,
     pose: PosePrior | None = None,
-    parameter_blocks: ParameterBlocks | None = None,
+    inputs: InputBlocks | None = None,
+    blocks: Callable[[SurfaceDistance], Sequence[ParameterBlock]] | None = None,
     modulus_deviation: float = 0.0,
     elsewhere: ArrayLike | None = None,
 ) -> Registrar:
@@ -535,7 +539,8 @@ def prepare(
         directions: most directions of force kept.
         options: noise, solver, thinning, search for the place of the forces.
         pose: prior of the pose; None for clouds in the body's coordinates.
-        parameter_blocks: unknowns beside the forces; none if not given. Nodes that they move carry no unknown force.
+        inputs: unknown inputs beside the forces; none if not given. Nodes that they move carry no unknown force.
+        blocks: further parameters, by the observed side.
         modulus_deviation: as for `Registrar`.
         elsewhere: further nodes, where forces are thought of when those given leave what neighbouring points share.
 
@@ -548,17 +553,17 @@ def prepare(
     spread = POLICY.force_spread_anywhere if is_anywhere else POLICY.force_spread
     scale = LogNormalPrior(force_scale, spread, minimum=1e-2 * force_scale)
     if nodes is None:
-        if parameter_blocks is None and pose is None:
+        if inputs is None and pose is None:
             raise ValueError("prepare.nodes: expected nodes that may carry force where nothing else is unknown.")
         options = replace(options, localisation=replace(options.localisation, rounds=0))
         forces = known_forces(model.body, scale)
     else:
         carrying = np.asarray(nodes, dtype=np.int64)
-        if parameter_blocks is not None:
-            carrying = np.setdiff1d(carrying, parameter_blocks.moved)
+        if inputs is not None:
+            carrying = np.setdiff1d(carrying, inputs.moved_nodes)
         every = nodal_forces(model.body, carrying, scale, smoothness)
         rule = LikelihoodInformed(options.noise.minimum, scale=10.0 * force_scale, maximum=directions)
-        forces = Prepared.of(model, observed, every, parameter_blocks).informed(observed, rule).forces
+        forces = Prepared.of(model, observed, every, inputs).informed(observed, rule).forces
 
     def anywhere() -> Registrar:
         return prepare(
@@ -570,7 +575,8 @@ def prepare(
             directions=directions,
             options=options,
             pose=pose,
-            parameter_blocks=parameter_blocks,
+            inputs=inputs,
+            blocks=blocks,
         )
 
     return Registrar(
@@ -579,7 +585,8 @@ def prepare(
         forces,
         options,
         pose=pose,
-        parameter_blocks=parameter_blocks,
+        inputs=inputs,
+        blocks=() if blocks is None else blocks(observed),
         modulus_deviation=modulus_deviation,
         anywhere=None if elsewhere is None or nodes is None else anywhere,
     )

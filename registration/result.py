@@ -9,17 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from .evaluation import Evaluation
 from .forward import State
 from .gauss_newton import IterationRecord
 from .local_model import LocalModel
 from .loss import REJECTED
 from .options import NOISE
 from .outcome import Outcome
-from .parameter_blocks import Estimate
+from .parameters.block import Estimate
 from .pose import Pose
 from .posterior import Posterior
 from .prepared import Prepared
-from .problem import Evaluation, Problem
+from .problem import Problem
 from .uncertainty import CoordinateFrame, Uncertainty, uncertainty
 from .verdict import Check, Judgement, Verdict
 
@@ -129,10 +130,8 @@ class Registration:
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:
         """What is known of stiffness and other unknowns beside the forces; none where there are none."""
-        parameter_blocks, part = self.problem.parameter_blocks, self.problem.parameter_part
-        if parameter_blocks is None:
-            return ()
-        return parameter_blocks.estimates(self.coefficients[part], self.posterior.covariance[part, part])
+        known = self.problem.known(self.evaluation, self.posterior)
+        return tuple(each for block, own in known for each in block.estimates(own.mean, own.covariance))
 
     @cached_property
     def chance_of_pose(self) -> float:
@@ -150,14 +149,12 @@ class Registration:
 
         It is all that a state under nodal forces and fixed supports depends on. None where the modulus is no unknown.
         """
-        parameter_blocks, problem = self.problem.parameter_blocks, self.problem
-        unknown = None if parameter_blocks is None else parameter_blocks.modulus
-        if parameter_blocks is None or unknown is None:
+        inputs, problem = self.problem.inputs, self.problem
+        unknown = None if inputs is None else inputs.modulus
+        if inputs is None or unknown is None:
             return None
-        place, deviation = problem.parameter_part.start + unknown[0], unknown[1]
-        modulus = float(
-            np.mean(parameter_blocks.inputs(self.coefficients[problem.parameter_part]).parameters["young_modulus"])
-        )
+        place, deviation = problem.input_part.start + unknown[0], unknown[1]
+        modulus = float(np.mean(inputs.inputs(self.coefficients[problem.input_part]).parameters["young_modulus"]))
         slopes = problem.net_forces(self.evaluation) / modulus
         slopes[:, place] -= deviation * self.net_force / modulus
         covariance = self.posterior.net_force_covariance(slopes, problem.forces.left_out / modulus**2)

@@ -8,7 +8,7 @@ weights make the statistic smaller where the model is right, so that chances are
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -92,7 +92,7 @@ def gain_by_shared_noise(local: LocalModel, problem: Problem) -> tuple[float, fl
     best = (-np.inf, 0.0, 0.0)
     if problem.shared is None:
         return best
-    few = _SharedNoise(local, replace(problem, shared=problem.shared.leading(_FIRST)))
+    few = _SharedNoise(local, problem.with_shared(problem.shared.leading(_FIRST)))
     if all(few.promised(length) < _HOPED for length in few.lengths):
         return best
     every = _SharedNoise(local, problem)
@@ -109,8 +109,8 @@ class _SharedNoise:
 
     def __init__(self, local: LocalModel, problem: Problem) -> None:
         assert problem.shared is not None
-        self._modes, hyperprior = problem.shared, problem.hyperprior
-        pull, self._covariance = _pull(local, problem.by_shared_noise(local.evaluation))
+        self._modes, hyperprior = problem.shared.modes, problem.hyperprior
+        pull, self._covariance = _pull(local, problem.shared.by_points(local.evaluation))
         weights, scaled = local.weights, local.problem.residuals(local.evaluation, local.own) / local.deviations
         shrunk = float(np.sum((weights * scaled) ** 2) / max(weights.sum(), 1e-300))
         self._pull = pull / np.sqrt(max(shrunk, 1e-300))

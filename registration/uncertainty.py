@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,11 @@ from scipy.stats import chi2
 
 from softtwin.meshes.embedding import Embedding
 
-from .forward import ParametrisedState, ReducedModel
+from .evaluation import Evaluation
+from .forward import ReducedModel
+from .parameters.nodal_forces import NodalForces
 from .posterior import Posterior
-from .priors import NodalForces
-from .problem import Evaluation, Problem
+from .problem import Problem
 
 Floats = NDArray[np.float64]
 CoordinateFrame = Literal["body", "camera"]  # what is attached to the organ's support lies still, or what the camera is
@@ -150,11 +151,11 @@ def uncertainty(
     """
     rest = np.zeros(len(problem.observed.body.points))
     if problem.error is not None:
-        rest = posterior.scales.margin_discrepancy * problem.error.size * problem.error.discrepancy.rest
+        rest = posterior.scales.margin_discrepancy * problem.error.amplitude * problem.error.discrepancy.rest
     if not np.isfinite(posterior.covariance).all():  # of a cloud that tells nothing that could be believed
         return Uncertainty(np.zeros((3 * len(rest), 1)), np.full(len(rest), np.inf))
     slopes, moving = _by_unknowns(problem, evaluation), np.ones(problem.size, dtype=bool)
-    moving[problem.error_part.stop :] = False
+    moving[problem.moving.stop :] = False
     if frame == "camera" and problem.pose is not None and evaluation.pose is not None:
         places = problem.observed.body.points + evaluation.state.full.displacement + problem.correction(evaluation)
         slopes, unseen = _turned(evaluation.pose.rotation, slopes), _turned(evaluation.pose.rotation, unseen)
@@ -172,14 +173,11 @@ def _by_unknowns(problem: Problem, evaluation: Evaluation) -> Floats:
 
     Those of pose and correlated noise move no node.
     """
-    state = evaluation.state.full
     slopes = np.zeros((problem.observed.body.points.size, problem.size))
-    if problem.forces.size:
-        slopes[:, problem.force_part] = problem.stiffness_scaling(evaluation)[0] * state.jvp(problem.forces.basis)
-    if problem.parameter_blocks is not None:
-        slopes[:, problem.parameter_part] = cast(ParametrisedState, evaluation.state).by_parameters()
-    if problem.error is not None:
-        slopes[:, problem.error_part] = problem.error.size * problem.error.discrepancy.modes
+    for block, part in problem.parts:
+        columns = block.full_columns(evaluation, evaluation.coefficients[part])
+        if columns is not None:
+            slopes[:, part] = columns
     return slopes
 
 

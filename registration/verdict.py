@@ -6,6 +6,9 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 from typing import Any
 
+import numpy as np
+from scipy.special import ndtr
+
 
 class Verdict(Enum):
     """What a result may be used for."""
@@ -41,6 +44,7 @@ class Code(Enum):
     FORCES_ELSEWHERE = "forces_elsewhere"
     CONTACT = "contact"
     TRACKING = "tracking"
+    RESIDUAL_TERM = "residual_term"
 
 
 @dataclass(frozen=True)
@@ -125,3 +129,48 @@ class Judgement:
     def is_usable(self) -> bool:
         """True unless it is refused."""
         return self.verdict is not Verdict.REFUSED
+
+
+def checked(
+    code: Code,
+    statistic: float,
+    level: float,
+    reason: str,
+    *,
+    refused: float | None = None,
+    unit: str = "",
+    is_minimum: bool = False,
+    law: tuple[str, float] | None = None,
+    subject: str = "",
+) -> Check:
+    """A check that is passed up to a level.
+
+    Args:
+        code: what is looked at.
+        statistic: what was found.
+        level: what is beyond is doubtful.
+        reason: that is given then.
+        refused: level beyond which the result is of no use; None for none.
+        unit: of both.
+        is_minimum: the level is the least that is enough: what is below it is beyond.
+        law: what the statistic is distributed like where the model is right, and the chance of one as far out.
+        subject: which of several it is about.
+    """
+    sign = -1.0 if is_minimum else 1.0
+    verdict = Verdict.ACCEPTED
+    if not sign * statistic <= sign * level:
+        verdict = Verdict.REFUSED if refused is not None and sign * statistic > sign * refused else Verdict.DOUBTFUL
+    reason = "" if verdict is Verdict.ACCEPTED else reason
+    name, chance = law or ("", None)
+    return Check(code, verdict, float(statistic), float(level), unit, is_minimum, name, chance, subject, reason)
+
+
+def largest_normal(value: float, count: int) -> tuple[str, float]:
+    """The chance of so large a deviation, the largest of several by their standard normal law."""
+    chance = of_several(2.0 * float(ndtr(-value)), count)
+    return f"largest of {count} standard normal deviations" if count > 1 else "standard normal", chance
+
+
+def of_several(chance: float, count: int) -> float:
+    """The chance that the largest of so many is as far out, where one is with a chance."""
+    return 1.0 if chance >= 1.0 else float(-np.expm1(count * np.log1p(-chance)))

@@ -14,7 +14,7 @@ from softtwin.meshes.export import Coordinates, write_points
 from softtwin.meshes.io import FileError, read_cloud
 from softtwin.registration.cloud import turned
 from softtwin.registration.pose import Pose
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 
 from .conftest import pulled, run, seen_cloud
 

@@ -26,8 +26,8 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.io import FileError, read_body, write_body
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import PosePrior
 
 from .conftest import pulled, run, seen_cloud
 

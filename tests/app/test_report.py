@@ -29,7 +29,7 @@ from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import LinearResponse
 from softtwin.reference.data.writing import create, write_block
 from softtwin.registration.outcome import Outcome
-from softtwin.registration.parameter_blocks import Estimate
+from softtwin.registration.parameters.block import Estimate
 from softtwin.registration.pose import Pose
 from softtwin.registration.result import Registration
 from softtwin.registration.uncertainty import Uncertainty

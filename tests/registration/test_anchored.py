@@ -10,7 +10,7 @@ from softtwin.meshes.body import Body
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.manifold_mapping import ManifoldMapping
-from softtwin.registration.priors import nodal_forces
+from softtwin.registration.parameters.nodal_forces import nodal_forces
 
 from .conftest import Cantilever, tip_forces
 from .test_engines import Bent

@@ -14,9 +14,9 @@ from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.options import RegistrationOptions, SparseLocalisation
 from softtwin.registration.outcome import Outcome
-from softtwin.registration.priors import nodal_forces
+from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, CantileverState, cloud_on, tip_forces

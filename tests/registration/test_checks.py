@@ -11,14 +11,16 @@ import pytest
 from scipy.stats import norm
 
 from softtwin.meshes.body import Body
-from softtwin.registration.checks import Expectations, _check, _largest_normal, _log_normal
+from softtwin.registration.checks import _log_normal
+from softtwin.registration.expectations import Expectations
 from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.parameters.nodal_forces import nodal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.result import Registration
-from softtwin.registration.verdict import Check, Code, Judgement, Verdict
+from softtwin.registration.surface_distance import SurfaceDistance
+from softtwin.registration.verdict import Check, Code, Judgement, Verdict, checked, largest_normal
 
 from .conftest import Cantilever, cloud_on, tip_forces
 
@@ -60,7 +62,7 @@ def test_an_accepted_result_shows_what_it_passed(found: Registration) -> None:
     ],
 )
 def test_levels(statistic: float, is_minimum: bool, verdict: Verdict) -> None:
-    made = _check(Code.LOAD, statistic, 1.0, "too much", refused=None if is_minimum else 2.0, is_minimum=is_minimum)
+    made = checked(Code.LOAD, statistic, 1.0, "too much", refused=None if is_minimum else 2.0, is_minimum=is_minimum)
     assert made.verdict is verdict and made.reason == ("" if verdict is Verdict.ACCEPTED else "too much")
 
 
@@ -98,7 +100,7 @@ def test_chances_are_those_of_draws(rng: np.random.Generator) -> None:
     draws = np.abs(rng.standard_normal((200_000, 6))).max(axis=1)
     for value in (1.0, 2.0, 3.0):
         share = float((draws > value).mean())
-        assert _largest_normal(value, 6)[1] == pytest.approx(share, abs=4.0 * np.sqrt(share / len(draws)))
+        assert largest_normal(value, 6)[1] == pytest.approx(share, abs=4.0 * np.sqrt(share / len(draws)))
     prior = LogNormalPrior(1e-3, 0.5)
     law = _log_normal(2e-3, prior)
     assert law is not None and law[1] == pytest.approx(norm.sf(np.log(2.0) / 0.5))

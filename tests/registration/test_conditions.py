@@ -13,11 +13,15 @@ from softtwin.meshes.body import Body
 from softtwin.reference.data.inputs import Change, Inputs
 from softtwin.reference.data.loading import Loading
 from softtwin.reference.data.materials import NeoHookean
-from softtwin.registration.contact import Contact, ContactRegistrar, Patch
+from softtwin.registration.contact import ContactRegistrar, Patch
 from softtwin.registration.options import expected_force
-from softtwin.registration.parameter_blocks import ParameterBlocks, PoissonRatio, PrescribedMotion, YoungModulus
+from softtwin.registration.parameters.contact import Contact
+from softtwin.registration.parameters.inputs import InputBlocks
+from softtwin.registration.parameters.poisson_ratio import PoissonRatio
+from softtwin.registration.parameters.pose import PosePrior
+from softtwin.registration.parameters.prescribed_motion import PrescribedMotion
+from softtwin.registration.parameters.young_modulus import YoungModulus
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import PosePrior
 from softtwin.registration.registrar import prepare
 from softtwin.registration.verdict import Verdict
 
@@ -31,7 +35,7 @@ def farther_half(body: Body) -> np.ndarray:
     return np.flatnonzero(body.points[body.cells].mean(axis=1)[:, 0] > 0.4)
 
 
-def everything(body: Body) -> ParameterBlocks:
+def everything(body: Body) -> InputBlocks:
     """One of each, with coefficients that none of them leaves out."""
     moduli = np.linspace(3000.0, 9000.0, len(body.cells))
     unknowns = (
@@ -41,7 +45,7 @@ def everything(body: Body) -> ParameterBlocks:
         PrescribedMotion("tip", 0.1, 0.02),
         Contact(body.boundary_nodes, np.array([0.5, 0.1, 0.2]), 0.1, 0.06, 2.0),
     )
-    return ParameterBlocks(body, {"young_modulus": moduli, "poisson_ratio": 0.45}, unknowns)
+    return InputBlocks(body, {"young_modulus": moduli, "poisson_ratio": 0.45}, unknowns)
 
 
 def as_vector(inputs: Inputs, body: Body) -> np.ndarray:
@@ -59,28 +63,28 @@ def change_as_vector(change: Change, body: Body) -> np.ndarray:
 
 
 def test_forces_grow_with_the_bodys_stiffness_alone(body: Body, rng: np.random.Generator) -> None:
-    parameter_blocks, step = everything(body), 1e-6
-    at = 0.5 * rng.standard_normal(parameter_blocks.count)
-    stiffness_scaling, slopes = parameter_blocks.stiffness_scaling(at)
-    scaling = parameter_blocks.stiffness_scaling
+    input_blocks, step = everything(body), 1e-6
+    at = 0.5 * rng.standard_normal(input_blocks.size)
+    stiffness_scaling, slopes = input_blocks.stiffness_scaling(at)
+    scaling = input_blocks.stiffness_scaling
     differences = [(scaling(at + e)[0] - scaling(at - e)[0]) / (2.0 * step)
                    for e in step * np.eye(len(at))]  # fmt: skip
     np.testing.assert_allclose(slopes, differences, atol=1e-8)
     assert (
         stiffness_scaling != 1.0
         and np.flatnonzero(slopes).tolist() == [0]
-        and parameter_blocks.stiffness_scaling(0.0 * at)[0] == 1.0
+        and input_blocks.stiffness_scaling(0.0 * at)[0] == 1.0
     )
-    of_region = ParameterBlocks(body, parameter_blocks.parameters, parameter_blocks.blocks[1:])
+    of_region = InputBlocks(body, input_blocks.parameters, input_blocks.blocks[1:])
     assert of_region.stiffness_scaling(at[1:])[0] == 1.0 and not of_region.stiffness_scaling(at[1:])[1].any()
 
 
 def test_the_inputs_derivatives_are_their_differences(body: Body, rng: np.random.Generator) -> None:
-    parameter_blocks, step = everything(body), 1e-6
-    at = 0.5 * rng.standard_normal(parameter_blocks.count)
-    for place, change in enumerate(parameter_blocks.changes(at)):
+    input_blocks, step = everything(body), 1e-6
+    at = 0.5 * rng.standard_normal(input_blocks.size)
+    for place, change in enumerate(input_blocks.changes(at)):
         ahead, back = (
-            as_vector(parameter_blocks.inputs(at + sign * step * np.eye(len(at))[place]), body) for sign in (1, -1)
+            as_vector(input_blocks.inputs(at + sign * step * np.eye(len(at))[place]), body) for sign in (1, -1)
         )
         slope = (ahead - back) / (2.0 * step)
         assert np.abs(slope).max() > 0.0
@@ -88,22 +92,22 @@ def test_the_inputs_derivatives_are_their_differences(body: Body, rng: np.random
 
 
 def test_no_coefficient_leads_out_of_what_can_be(body: Body) -> None:
-    parameter_blocks = ParameterBlocks(body, WRONG.parameters, (YoungModulus(0.5), PoissonRatio(1.0)))
+    input_blocks = InputBlocks(body, WRONG.parameters, (YoungModulus(0.5), PoissonRatio(1.0)))
     for far in (-60.0, 60.0):
-        found = parameter_blocks.inputs(np.full(2, far)).parameters
+        found = input_blocks.inputs(np.full(2, far)).parameters
         assert found["young_modulus"] >= 10.0
         assert 0.2 <= found["poisson_ratio"] < 0.5
-    assert parameter_blocks.inputs(np.array([-60.0, 0.0])).parameters["young_modulus"] == pytest.approx(10.0, abs=1e-6)
+    assert input_blocks.inputs(np.array([-60.0, 0.0])).parameters["young_modulus"] == pytest.approx(10.0, abs=1e-6)
 
 
 def test_an_interval_holds_what_a_normal_law_puts_there(body: Body, rng: np.random.Generator) -> None:
     """A region's modulus is the body's times its own growth: their laws go together."""
     moduli = np.full(len(body.cells), 4000.0)
     unknowns = (YoungModulus(0.5), YoungModulus(0.8, farther_half(body), "tumour"), PoissonRatio())
-    parameter_blocks = ParameterBlocks(body, {"young_modulus": moduli, "poisson_ratio": 0.45}, unknowns)
+    input_blocks = InputBlocks(body, {"young_modulus": moduli, "poisson_ratio": 0.45}, unknowns)
     mean, root = np.array([0.3, -0.5, 0.2]), 0.4 * rng.standard_normal((3, 3))
-    whole, region, ratio = parameter_blocks.estimates(mean, root @ root.T)
-    drawn = [parameter_blocks.inputs(mean + root @ draw).parameters for draw in rng.standard_normal((4000, 3))]
+    whole, region, ratio = input_blocks.estimates(mean, root @ root.T)
+    drawn = [input_blocks.inputs(mean + root @ draw).parameters for draw in rng.standard_normal((4000, 3))]
     values = {
         whole: [float(found["young_modulus"][0]) for found in drawn],
         region: [float(found["young_modulus"][farther_half(body)[0]]) for found in drawn],
@@ -126,7 +130,7 @@ def several(body: Body) -> dict[str, tuple[dict, tuple]]:
         "at least one of the body's": (whole, lambda: (YoungModulus(1.0, np.zeros(0, dtype=np.int64)),)),
         "one Young's modulus for each cell": (whole, lambda: (YoungModulus(1.0, np.array([0])),)),
         r"PrescribedMotion\.name: expected a node set among": (ratio, lambda: (PrescribedMotion("grip"),)),
-        "each unknown once": (whole, lambda: (YoungModulus(), YoungModulus(0.3))),
+        "each input once": (whole, lambda: (YoungModulus(), YoungModulus(0.3))),
         "at least one node that may be touched": (
             ratio,
             lambda: (Contact(np.zeros(0, dtype=np.int64), np.zeros(3), 0.1, 0.1, 1.0),),
@@ -138,7 +142,7 @@ def several(body: Body) -> dict[str, tuple[dict, tuple]]:
 def test_bad_unknowns_are_named(body: Body, message: str) -> None:
     parameters, unknowns = several(body)[message]
     with pytest.raises(ValueError, match=message):
-        ParameterBlocks(body, parameters, unknowns())
+        InputBlocks(body, parameters, unknowns())
 
 
 def test_what_can_take_no_conditions_says_so(body: Body) -> None:
@@ -146,9 +150,9 @@ def test_what_can_take_no_conditions_says_so(body: Body) -> None:
         def reduced(self, nodes: np.ndarray, basis: np.ndarray) -> None:
             raise AssertionError("not asked for")
 
-    parameter_blocks = ParameterBlocks(body, WRONG.parameters, (YoungModulus(),))
+    input_blocks = InputBlocks(body, WRONG.parameters, (YoungModulus(),))
     with pytest.raises(ValueError, match="has learned one material and one support"):
-        prepare(Learned(body), body.node_sets["tip"], force_scale=1.0, parameter_blocks=parameter_blocks)
+        prepare(Learned(body), body.node_sets["tip"], force_scale=1.0, inputs=input_blocks)
 
 
 def test_nothing_unknown_is_refused(body: Body) -> None:
@@ -178,29 +182,29 @@ def reference(body: Body, material: NeoHookean, loading: Loading | None = None, 
 
 def under_known_load(body: Body, load: np.ndarray, material: NeoHookean, unknowns: tuple):
     model = reference(body, material, Loading(forces=load))
-    parameter_blocks = ParameterBlocks(body, material.parameters, unknowns)
-    return prepare(model, None, body.surfaces["observed"], force_scale=1.0, parameter_blocks=parameter_blocks)
+    input_blocks = InputBlocks(body, material.parameters, unknowns)
+    return prepare(model, None, body.surfaces["observed"], force_scale=1.0, inputs=input_blocks)
 
 
 @pytest.mark.fenicsx
 def test_a_state_moves_with_its_inputs_as_differences_say(body: Body, solved, rng: np.random.Generator) -> None:
     moduli = np.linspace(3000.0, 9000.0, len(body.cells))
     model = reference(body, NeoHookean(moduli, 0.45), held={"fixed": "xyz", "tip": "xyz"})
-    parameter_blocks = replace(everything(body), blocks=everything(body).blocks[:4])
+    input_blocks = replace(everything(body), blocks=everything(body).blocks[:4])
     forces, at, step = tip_forces(body, (0.0, 0.1, -0.4)), 0.4 * rng.standard_normal(9), 1e-4
     forces[body.node_sets["tip"]] = 0.0
     forces[body.points[:, 0] == 0.4] = [0.0, 0.02, -0.05]
-    state = model.solve(forces, None, parameter_blocks.inputs(at))
+    state = model.solve(forces, None, input_blocks.inputs(at))
     assert np.abs(state.displacement).max() > 5e-3
-    pushed = state.jvp_inputs(parameter_blocks.changes(at))
+    pushed = state.jvp_inputs(input_blocks.changes(at))
     for place in range(9):
         ahead, back = (
-            model.solve(forces, state, parameter_blocks.inputs(at + sign * step * np.eye(9)[place])).displacement
+            model.solve(forces, state, input_blocks.inputs(at + sign * step * np.eye(9)[place])).displacement
             for sign in (1.0, -1.0)
         )
         slope = (ahead - back).ravel() / (2.0 * step)
         np.testing.assert_allclose(pushed[:, place], slope, atol=1e-3 * np.abs(slope).max(), err_msg=str(place))
-    again = state.jvp_inputs(parameter_blocks.changes(at))  # the model has been elsewhere since
+    again = state.jvp_inputs(input_blocks.changes(at))  # the model has been elsewhere since
     np.testing.assert_allclose(again, pushed, atol=1e-9 * np.abs(pushed).max())
     model.problem.close()
 
@@ -216,7 +220,7 @@ def test_stiffness_and_ratio_are_found_under_a_known_force(body: Body, solved, r
     for _ in range(24):
         found = registrar.register(cloud_on(body, truth, 600, rng, 2e-3))
         assert found.judgement.verdict is Verdict.ACCEPTED, found.judgement.reasons
-        part = found.problem.parameter_part
+        part = found.problem.input_part
         missed = found.coefficients[part] - true
         scores.append(missed @ np.linalg.solve(found.posterior.covariance[part, part], missed))
     assert chi2.ppf(1e-4, 48) < np.sum(scores) < chi2.ppf(1.0 - 1e-4, 48)
@@ -239,14 +243,14 @@ def test_under_dead_forces_a_cloud_tells_forces_over_stiffness_alone(
     found = {}
     for known, deviation in {"well": 0.05, "badly": 0.4}.items():
         model = reference(body, NeoHookean(6500.0, 0.42))
-        parameter_blocks = ParameterBlocks(body, model.problem.material.parameters, (YoungModulus(deviation),))
+        input_blocks = InputBlocks(body, model.problem.material.parameters, (YoungModulus(deviation),))
         registrar = prepare(
             model,
             body.node_sets["tip"],
             body.surfaces["observed"],
             force_scale=expected_force(body, 6500.0),
             smoothness=0.1,
-            parameter_blocks=parameter_blocks,
+            inputs=input_blocks,
         )
         found[known] = result = registrar.register(cloud)
         ratio, doubt = result.force_over_modulus
@@ -269,7 +273,7 @@ def test_stiffness_ratio_forces_and_pose_are_found_together(body: Body, solved, 
     true = Pose.identity().moved(np.array([0.01, 0.03, -0.02, 2e-3, -3e-3, 1e-3]), centre)
     truth = solved.solve(tip_forces(body, tuple(net))).displacement
     model = reference(body, NeoHookean(5500.0, 0.45))
-    parameter_blocks = ParameterBlocks(body, model.problem.material.parameters, (YoungModulus(0.3), PoissonRatio()))
+    input_blocks = InputBlocks(body, model.problem.material.parameters, (YoungModulus(0.3), PoissonRatio()))
     registrar = prepare(
         model,
         body.node_sets["tip"],
@@ -277,7 +281,7 @@ def test_stiffness_ratio_forces_and_pose_are_found_together(body: Body, solved, 
         force_scale=expected_force(body, 5500.0),
         smoothness=0.1,
         pose=PosePrior(Pose.identity(), centre, np.deg2rad(5.0), 0.01),
-        parameter_blocks=parameter_blocks,
+        inputs=input_blocks,
     )
     found = registrar.register(true.apply(cloud_on(body, truth, 800, rng, 5e-4)))
     assert found.judgement.verdict is Verdict.ACCEPTED, found.judgement.reasons
@@ -318,8 +322,8 @@ def test_a_stiff_region_is_found_beside_the_stiffness_of_the_rest(body: Body, rn
         cloud = cloud_on(body, problem.solve(weight).displacement, 800, rng, 5e-4)
     model = reference(body, NeoHookean(np.full(len(body.cells), 5000.0), 0.42), weight)
     unknowns = (YoungModulus(), YoungModulus(1.0, region, "tumour"))
-    parameter_blocks = ParameterBlocks(body, model.problem.material.parameters, unknowns)
-    registrar = prepare(model, None, body.surfaces["observed"], force_scale=1.0, parameter_blocks=parameter_blocks)
+    input_blocks = InputBlocks(body, model.problem.material.parameters, unknowns)
+    registrar = prepare(model, None, body.surfaces["observed"], force_scale=1.0, inputs=input_blocks)
     rest, stiff = registrar.register(cloud).estimates
     assert rest.value == pytest.approx(4000.0, rel=0.02)
     assert stiff.interval[0] < 12000.0 < stiff.interval[1]
@@ -335,8 +339,8 @@ def test_a_region_that_was_moved_is_found(body: Body, rng: np.random.Generator) 
     twist = np.array([0.2, -0.1, 0.15, -0.02, 0.03, 0.05])
     moved = Pose.identity().moved(twist, places.mean(axis=0)).apply(places) - places
     truth = model.problem.solve(Loading(displacement={"tip": moved})).displacement
-    parameter_blocks = ParameterBlocks(body, TRUTH.parameters, (PrescribedMotion("tip", 0.3, 0.05),))
-    registrar = prepare(model, None, body.surfaces["observed"], force_scale=1.0, parameter_blocks=parameter_blocks)
+    input_blocks = InputBlocks(body, TRUTH.parameters, (PrescribedMotion("tip", 0.3, 0.05),))
+    registrar = prepare(model, None, body.surfaces["observed"], force_scale=1.0, inputs=input_blocks)
     found = registrar.register(cloud_on(body, truth, 600, rng, 1e-3))
     assert found.judgement.verdict is Verdict.ACCEPTED, found.judgement.reasons
     # Along the beam the cloud tells little: how much, the doubt says, and the error has to keep to it.
@@ -356,8 +360,8 @@ def test_one_contact_is_found_where_it_is(body: Body, solved, rng: np.random.Gen
 
     nodes = np.setdiff1d(body.boundary_nodes, body.fixed)
     contact = Contact(nodes, np.array([0.6, 0.15, 0.2]), 0.1, 0.08, 1.0)
-    parameter_blocks = ParameterBlocks(body, {}, (contact,))
-    forces = parameter_blocks.forces(np.array([0.0, 0.0, 0.0, 0.2, 0.1, -1.0]))
+    input_blocks = InputBlocks(body, {}, (contact,))
+    forces = input_blocks.forces(np.array([0.0, 0.0, 0.0, 0.2, 0.1, -1.0]))
     truth = solved.solve(forces).displacement
     anywhere = prepare(
         ReferenceModel(solved, patient=False),
@@ -387,7 +391,7 @@ def test_two_contacts_are_not_taken_for_one(body: Body, solved, rng: np.random.G
     forces = np.zeros_like(body.points)
     for place, force in {(0.4, 0.1, 0.2): [0.0, 0.0, -4.0], (0.8, 0.1, 0.2): [0.0, 1.0, 1.5]}.items():
         contact = Contact(nodes, np.array(place), 0.1, 0.05, 1.0)
-        forces += ParameterBlocks(body, {}, (contact,)).forces(np.concatenate([np.zeros(3), force]))
+        forces += InputBlocks(body, {}, (contact,)).forces(np.concatenate([np.zeros(3), force]))
     truth = solved.solve(forces).displacement
     anywhere = prepare(
         ReferenceModel(solved, patient=False),
@@ -464,7 +468,7 @@ def test_stiffness_that_is_not_known_goes_into_the_newtons_of_one_contact(
     from softtwin.reference.derivatives.model import ReferenceModel
 
     nodes = np.setdiff1d(body.boundary_nodes, body.fixed)
-    contact = ParameterBlocks(body, {}, (Contact(nodes, np.array([0.6, 0.15, 0.2]), 0.1, 0.08, 1.0),))
+    contact = InputBlocks(body, {}, (Contact(nodes, np.array([0.6, 0.15, 0.2]), 0.1, 0.08, 1.0),))
     truth = solved.solve(contact.forces(np.array([0.0, 0.0, 0.0, 0.2, 0.1, -1.0]))).displacement
     cloud = cloud_on(body, truth, 800, rng, 1e-3)
     found = []
@@ -493,9 +497,9 @@ def test_a_modulus_is_found_from_a_million_times_as_much(rng: np.random.Generato
     from softtwin.registration.gauss_newton import GaussNewton
     from softtwin.registration.hyperparameters import LogNormalPrior
     from softtwin.registration.loss import Square
-    from softtwin.registration.priors import known_forces
+    from softtwin.registration.parameters.nodal_forces import known_forces
     from softtwin.registration.problem import Problem as Search
-    from softtwin.registration.residuals import SurfaceDistance
+    from softtwin.registration.surface_distance import SurfaceDistance
 
     bar, exact = beam((10, 2, 2), (1.0, 0.2, 0.2), "hexahedron"), LogNormalPrior(1e-9, 0.0, minimum=1e-9)
     with Problem(bar, NeoHookean(4500.0, 0.45), NewtonOptions(tolerance=1e-12)) as problem:
@@ -504,14 +508,14 @@ def test_a_modulus_is_found_from_a_million_times_as_much(rng: np.random.Generato
         assert np.abs(truth).max() > 0.2
         corners = (bar.points + truth)[bar.boundary[rng.integers(len(bar.boundary), size=1500)]]
         cloud = np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), size=1500), corners)
-        parameter_blocks = ParameterBlocks(bar, {"young_modulus": 4.5e9, "poisson_ratio": 0.45}, (YoungModulus(10.0),))
+        input_blocks = InputBlocks(bar, {"young_modulus": 4.5e9, "poisson_ratio": 0.45}, (YoungModulus(10.0),))
         observed, none = SurfaceDistance(bar), known_forces(bar)
         from softtwin.reference.derivatives.model import ReferenceModel
 
         model = ReferenceModel(problem, loading=Loading(forces=forces))
-        reduced = reduce_model(model, observed.nodes, none.basis, parameter_blocks)
-        search = Search(reduced, observed, none, None, cloud, exact, parameter_blocks=parameter_blocks)
+        reduced = reduce_model(model, observed.nodes, none.basis, input_blocks)
+        search = Search.of(reduced, observed, cloud, exact, (none, input_blocks))
         solver = GaussNewton((Square(),), max_iterations=100, settled=1e-3, minimum_step=1e-14, graduation=0.0)
         found = solver.solve(search, np.zeros(1))
-    modulus = parameter_blocks.inputs(found.evaluation.coefficients).parameters["young_modulus"]
+    modulus = input_blocks.inputs(found.evaluation.coefficients).parameters["young_modulus"]
     assert modulus == pytest.approx(4500.0, rel=1e-8)

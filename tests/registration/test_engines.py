@@ -18,10 +18,11 @@ from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.outcome import Outcome
+from softtwin.registration.parameters.nodal_forces import nodal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar, register_sequence
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, CantileverState, cloud_on, tip_forces

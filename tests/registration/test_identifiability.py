@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.inputs import Change, Inputs
-from softtwin.registration.identifiability import uninformed
-from softtwin.registration.parameter_blocks import ParameterBlocks, PoissonRatio, YoungModulus
+from softtwin.registration.parameters.identifiability import uninformed
+from softtwin.registration.parameters.inputs import InputBlocks
+from softtwin.registration.parameters.poisson_ratio import PoissonRatio
+from softtwin.registration.parameters.young_modulus import YoungModulus
 from softtwin.registration.registrar import prepare
 from softtwin.registration.result import Registration
 from softtwin.registration.verdict import Verdict
@@ -73,9 +75,9 @@ def halves(body: Body) -> tuple[np.ndarray, np.ndarray]:
 
 def registered(body: Body, parts: tuple[float, float], unknowns: tuple, rng: np.random.Generator) -> Registration:
     model = SpringModel(body, parts)
-    parameter_blocks = ParameterBlocks(body, {"young_modulus": np.full(len(body.cells), MODULUS)}, unknowns)
-    registrar = prepare(model, None, body.surfaces["observed"], force_scale=1.0, parameter_blocks=parameter_blocks)
-    truth = model.solve(0.0, None, parameter_blocks.inputs(np.full(parameter_blocks.count, 0.1))).displacement
+    input_blocks = InputBlocks(body, {"young_modulus": np.full(len(body.cells), MODULUS)}, unknowns)
+    registrar = prepare(model, None, body.surfaces["observed"], force_scale=1.0, inputs=input_blocks)
+    truth = model.solve(0.0, None, input_blocks.inputs(np.full(input_blocks.size, 0.1))).displacement
     return registrar.register(cloud_on(body, truth, 600, rng, 5e-4))
 
 
@@ -86,7 +88,7 @@ def test_a_collinear_pair_is_named_and_neither_of_them_alone(body: Body, rng: np
     (reason,) = found.judgement.reasons
     assert "does not tell Young's modulus of" in reason and " against Young's modulus of " in reason
     assert "root" in reason and "tumour" in reason
-    part = found.problem.parameter_part
+    part = found.problem.input_part
     values = np.linalg.eigvalsh(found.posterior.covariance[part, part])
     assert values[0] < 0.01 and values[1] > 0.99  # the sum is told, the difference is not
 
@@ -108,13 +110,11 @@ def test_one_that_is_not_seen_at_all_is_named_alone(body: Body, rng: np.random.G
 
 
 def test_a_pair_that_is_told_is_accepted(body: Body) -> None:
-    parameter_blocks = ParameterBlocks(
-        body, {"young_modulus": MODULUS, "poisson_ratio": 0.4}, (YoungModulus(), PoissonRatio())
-    )
+    input_blocks = InputBlocks(body, {"young_modulus": MODULUS, "poisson_ratio": 0.4}, (YoungModulus(), PoissonRatio()))
     names = ["E", "nu"]
-    assert uninformed(parameter_blocks, names, np.diag([0.1, 0.3]), 0.5) == ([], [])
-    assert uninformed(parameter_blocks, names, np.full((2, 2), np.nan), 0.5) == ([], [])
-    assert uninformed(parameter_blocks, names, np.eye(2), 0.5) == (
+    assert uninformed(input_blocks.shares, names, np.diag([0.1, 0.3]), 0.5) == ([], [])
+    assert uninformed(input_blocks.shares, names, np.full((2, 2), np.nan), 0.5) == ([], [])
+    assert uninformed(input_blocks.shares, names, np.eye(2), 0.5) == (
         names,
         [],
     )  # of what is told not at all, no combination
@@ -124,9 +124,7 @@ def test_a_pair_that_is_told_is_accepted(body: Body) -> None:
     ("direction", "words"), [((1.0, -1.0), "E against nu"), ((1.0, 2.0), "nu with E"), ((-2.0, 1.0), "E against nu")]
 )
 def test_a_direction_is_said_by_its_larger_share(body: Body, direction: tuple[float, float], words: str) -> None:
-    parameter_blocks = ParameterBlocks(
-        body, {"young_modulus": MODULUS, "poisson_ratio": 0.4}, (YoungModulus(), PoissonRatio())
-    )
+    input_blocks = InputBlocks(body, {"young_modulus": MODULUS, "poisson_ratio": 0.4}, (YoungModulus(), PoissonRatio()))
     along = np.array(direction) / np.linalg.norm(direction)
     covariance = 0.01 * np.eye(2) + 0.98 * np.outer(along, along)
-    assert uninformed(parameter_blocks, ["E", "nu"], covariance, 0.5) == ([], [words])
+    assert uninformed(input_blocks.shares, ["E", "nu"], covariance, 0.5) == ([], [words])

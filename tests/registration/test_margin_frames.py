@@ -18,11 +18,12 @@ from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Square
 from softtwin.registration.options import RegistrationOptions, SparseLocalisation
+from softtwin.registration.parameters.nodal_forces import NodalForces, nodal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import NodalForces, PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.result import Registration
+from softtwin.registration.surface_distance import SurfaceDistance
 
 from .conftest import Cantilever, cloud_on
 

@@ -11,15 +11,18 @@ from softtwin.meshes.body import Body
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
-from softtwin.registration.landmarks import LandmarkPairs
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.loss import Square
 from softtwin.registration.options import RegistrationOptions
+from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
+from softtwin.registration.parameters.discrepancy import ModelError
+from softtwin.registration.parameters.nodal_forces import nodal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import ModelError, PosePrior, nodal_forces
 from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.residuals.landmarks import LandmarkPairs
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -43,28 +46,30 @@ def problem(body: Body) -> Problem:
     forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4), smoothness=0.1)
     turned = Pose.identity().moved(np.array([0.1, -0.05, 0.02, 0.01, 0.0, -0.02]), np.zeros(3))
     pose = PosePrior(turned, body.points.mean(axis=0), 0.05, 0.01)
-    error = replace(ModelError.of(patterns(body), observed), size=0.1)
+    error = ModelError(patterns(body), observed, 0.1)
     cloud = pose.mean.apply(body.points[observed.nodes][::3] + 0.002)
     marks = marks_on(body, observed, 4)
     marks = replace(marks, places=pose.mean.apply(marks.places))
     reduced = reduce_model(model, observed.nodes, forces.basis)
-    noise, shared = LogNormalPrior(1e-3, 1.0), observed.modes.leading(10)
-    return Problem(reduced, observed, forces, pose, cloud, noise, error, landmarks=marks, shared=shared)
+    noise, shared = LogNormalPrior(1e-3, 1.0), CorrelatedNoise(observed.modes.leading(10))
+    return Problem.of(reduced, observed, cloud, noise, (forces, pose, error, shared), (marks,))
 
 
 def test_the_derivative_is_that_of_the_residuals(problem: Problem, rng: np.random.Generator) -> None:
     at = 0.1 * rng.standard_normal(problem.size)
     evaluation = problem.evaluation(at)
-    jacobian, step = problem.landmark_jacobian(evaluation), 1e-6
+    (marks,), step = problem.terms, 1e-6
+    slopes = marks.slopes(evaluation)
+    jacobian = problem.jacobian(evaluation, slopes)
     for column in range(problem.size):
         change = np.zeros(problem.size)
         change[column] = step
-        ahead, behind = (problem.landmark_residuals(problem.evaluation(at + sign * change)) for sign in (1.0, -1.0))
+        ahead, behind = (marks.values(problem.evaluation(at + sign * change)) for sign in (1.0, -1.0))
         wanted = (ahead - behind) / (2.0 * step)
         np.testing.assert_allclose(jacobian[:, column], wanted, atol=1e-6 * np.abs(jacobian).max())
-    assert not jacobian[:, problem.error_part.stop :].any()  # noise moves no mark
+    assert not jacobian[:, problem.moving.stop :].any()  # noise moves no mark
     cotangent = rng.standard_normal(len(jacobian))
-    np.testing.assert_allclose(problem.landmarks_vjp(evaluation, cotangent), cotangent @ jacobian, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(problem.vjp(evaluation, cotangent, slopes), cotangent @ jacobian, rtol=1e-9, atol=1e-9)
 
 
 def test_at_the_truth_nothing_is_left(body: Body) -> None:
@@ -90,7 +95,7 @@ def test_they_tell_what_the_cloud_does_not(body: Body, solver: GaussNewton | LBF
     own = registrar(body, solver)
     few = cloud[cloud[:, 0] < 0.8 * cloud[:, 0].max()]  # the end is not seen
     without = own.register(few)
-    with_marks = own.with_landmarks(marks_on(body, own.observed, 6, 2e-4)).register(few)
+    with_marks = own.with_terms(marks_on(body, own.observed, 6, 2e-4)).register(few)
     errors = [np.linalg.norm(result.displacement - u, axis=1).mean() for result in (without, with_marks)]
     assert errors[1] < 0.5 * errors[0]
     assert with_marks.uncertainty.deviation.mean() < without.uncertainty.deviation.mean()
@@ -104,7 +109,7 @@ def test_one_that_was_taken_for_another_makes_a_doubtful_frame(body: Body) -> No
     right = marks_on(body, own.observed, 4)
     places = right.places.copy()
     places[2] += 0.03
-    result = own.with_landmarks(replace(right, places=places)).register(cloud)
+    result = own.with_terms(replace(right, places=places)).register(cloud)
     assert result.judgement.verdict is not Verdict.ACCEPTED
     assert any("landmark 2 lies" in reason for reason in result.judgement.reasons)
 
@@ -114,7 +119,7 @@ def test_none_change_nothing(body: Body) -> None:
         body, Cantilever(body).solve(tip_forces(body, NET)).displacement, 300, np.random.default_rng(2), 5e-4
     )
     own = registrar(body, GaussNewton((Square(),)))
-    plain, marked = own.register(cloud), own.with_landmarks(None).register(cloud)
+    plain, marked = own.register(cloud), own.with_terms().register(cloud)
     np.testing.assert_array_equal(plain.displacement, marked.displacement)
 
 

@@ -8,16 +8,20 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body
+from softtwin.registration.evaluation import Evaluation
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.hyperparameters import DISCREPANCY, LogNormalPrior
 from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Square
 from softtwin.registration.options import options_for
+from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
+from softtwin.registration.parameters.discrepancy import ModelError, RestOfModelError
+from softtwin.registration.parameters.nodal_forces import nodal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import ModelError, PosePrior, nodal_forces
-from softtwin.registration.problem import Evaluation, Problem
+from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -151,16 +155,16 @@ def test_the_derivative_of_the_distances_is_exact(body: Body, rng) -> None:
     model, observed = Biased(body), SurfaceDistance(body, body.surfaces["observed"])
     forces = nodal_forces(body, body.node_sets["tip"][:4], LogNormalPrior(0.05, 0.5))
     prior = PosePrior(Pose.identity(), body.points.mean(axis=0))
-    error = replace(ModelError.of(model.discrepancy, observed), size=0.1)
+    error = ModelError(model.discrepancy, observed, 0.1)
     cloud = cloud_on(body, true_displacement(body, np.array([1.0, -1.0])), 100, rng, 5e-3)
     reduced = reduce_model(model, observed.nodes, forces.basis)
-    noise, shared = LogNormalPrior(1e-3, 1.0), observed.modes.leading(10)
-    problem = Problem(reduced, observed, forces, prior, cloud, noise, error, shared=shared)
+    noise, shared = LogNormalPrior(1e-3, 1.0), CorrelatedNoise(observed.modes.leading(10))
+    problem = Problem.of(reduced, observed, cloud, noise, (forces, prior, error, shared))
     at = 0.1 * rng.standard_normal(problem.size)
     evaluation, direction, step = problem.evaluation(at), rng.standard_normal(problem.size), 1e-6
-    moving = problem.error_part.stop
+    moving = problem.moving.stop
     alone = problem.size - moving
-    assert moving == forces.size + 6 + 2 and alone == len(error.rest_modes.values) + 3 * 10
+    assert moving == forces.size + 6 + 2 and alone == error.rest.size + 3 * 10
 
     def near(sign: float) -> Evaluation:
         return problem.evaluation(at + sign * step * direction, evaluation)
@@ -178,7 +182,7 @@ def test_the_derivative_of_the_distances_is_exact(body: Body, rng) -> None:
     taken = problem.residuals(replace(evaluation, coefficients=at + change), 1e-3)
     taken -= problem.residuals(evaluation, 1e-3)
     np.testing.assert_allclose(jacobian @ change, taken, rtol=1e-9, atol=1e-12)
-    assert np.abs(jacobian[:, problem.rest_part]).max() > 0.0
+    assert np.abs(jacobian[:, problem.part(RestOfModelError)]).max() > 0.0
     cotangent = rng.standard_normal(len(cloud))
     np.testing.assert_allclose(problem.vjp(evaluation, cotangent), jacobian.T @ cotangent, rtol=1e-8, atol=1e-10)
 
@@ -189,10 +193,10 @@ def test_margins_are_those_of_an_estimate_that_believed_the_model_too_much(
     """Drawn: unknowns and distances with the model's error as it was seen, an estimate made with 0.6 of it."""
     model, observed = Biased(body), SurfaceDistance(body, body.surfaces["observed"])
     forces = nodal_forces(body, body.node_sets["tip"][:2], LogNormalPrior(0.05, 0.0))
-    error = replace(ModelError.of(model.discrepancy, observed), size=0.1)
+    error = ModelError(model.discrepancy, observed, 0.1)
     cloud = cloud_on(body, true_displacement(body, np.zeros(2)), 100, rng, 1e-3)
     reduced = reduce_model(model, observed.nodes, forces.basis)
-    problem = Problem(reduced, observed, forces, None, cloud, LogNormalPrior(1e-4, 0.0), error)
+    problem = Problem.of(reduced, observed, cloud, LogNormalPrior(1e-4, 0.0), (forces, error))
     start = problem.hyperprior.median.copy()
     start[DISCREPANCY] = np.log(0.6)
     evaluation = problem.evaluation(np.zeros(problem.size))
@@ -210,4 +214,7 @@ def test_margins_are_those_of_an_estimate_that_believed_the_model_too_much(
     found = local.error_covariance()
     np.testing.assert_allclose(found, wanted, atol=0.04 * np.sqrt(np.outer(np.diag(wanted), np.diag(wanted))).max())
     assert (np.diag(found) > 0.999 * np.diag(local.solved(np.eye(problem.size)))).all()
-    assert np.diag(found)[problem.rest_part].sum() > 2.0 * 0.6**2 * variances[problem.rest_part].sum()
+    assert (
+        np.diag(found)[problem.part(RestOfModelError)].sum()
+        > 2.0 * 0.6**2 * variances[problem.part(RestOfModelError)].sum()
+    )

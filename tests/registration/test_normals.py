@@ -16,11 +16,15 @@ from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.options import RegistrationOptions
+from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
+from softtwin.registration.parameters.discrepancy import ModelError
+from softtwin.registration.parameters.nodal_forces import nodal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import ModelError, PosePrior, nodal_forces
 from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.residuals.normals import Normals
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -49,38 +53,38 @@ def problem(body: Body, rng: np.random.Generator) -> Problem:
     forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4), smoothness=0.1)
     mean = Pose.identity().moved(np.array([0.1, -0.05, 0.02, 0.01, 0.0, -0.02]), np.zeros(3))
     pose = PosePrior(mean, body.points.mean(axis=0), 0.05, 0.01)
-    error = replace(ModelError.of(patterns(body), observed), size=0.1)
+    error = ModelError(patterns(body), observed, 0.1)
     seen = oriented(body, model.solve(tip_forces(body, NET)).displacement, 80, 1)
     seen[3, 3:] = np.nan  # one was not measured
-    return Problem.seen(
+    cloud, reduced = (
         Cloud.of(turned(seen, mean.rotation, mean.translation)),
-        model=reduce_model(model, observed.nodes, forces.basis),
-        observed=observed,
-        forces=forces,
-        pose=pose,
-        noise=LogNormalPrior(1e-3, 1.0),
-        error=error,
-        shared=observed.modes.leading(10),
+        reduce_model(model, observed.nodes, forces.basis),
     )
+    shared, basis = CorrelatedNoise(observed.modes.leading(10)), cloud.tangent_basis
+    assert basis is not None
+    blocks = (forces, pose, error, shared)
+    return Problem.of(reduced, observed, cloud.points, LogNormalPrior(1e-3, 1.0), blocks, (Normals(basis),))
 
 
 def test_the_derivative_is_that_of_the_residuals(problem: Problem, rng: np.random.Generator) -> None:
     at = 0.1 * rng.standard_normal(problem.size)
     evaluation = problem.evaluation(at)
-    jacobian = problem.normal_jacobian(evaluation)
+    (normals,) = problem.terms
+    slopes = normals.slopes(evaluation)
+    jacobian = problem.jacobian(evaluation, slopes)
     assert jacobian.shape == (160, problem.size)
     assert not jacobian[6:8].any()  # of the point without a normal
     direction = rng.standard_normal(problem.size)
 
     def residuals(step: float) -> Floats:  # a point that goes on to the next triangle has another normal: held here
-        return problem.normal_residuals(problem.evaluation(at + step * direction, evaluation), evaluation.match)
+        return normals.values(problem.evaluation(at + step * direction, evaluation), evaluation.match)
 
     steps = 5e-3 * 0.5 ** np.arange(5)
     errors = [np.linalg.norm(residuals(h) - residuals(0.0) - h * jacobian @ direction) for h in steps]
     assert np.log2(np.divide(errors[:-1], errors[1:])).min() > 1.9
-    assert not jacobian[:, problem.error_part.stop :].any()  # noise turns no surface
+    assert not jacobian[:, problem.moving.stop :].any()  # noise turns no surface
     cotangent = rng.standard_normal(len(jacobian))
-    np.testing.assert_allclose(problem.normals_vjp(evaluation, cotangent), cotangent @ jacobian, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(problem.vjp(evaluation, cotangent, slopes), cotangent @ jacobian, rtol=1e-9, atol=1e-9)
 
 
 def test_planes_have_exact_derivatives(body: Body, rng: np.random.Generator) -> None:

@@ -13,9 +13,9 @@ from softtwin.meshes.body import Body
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import RegistrationOptions, SparseLocalisation
-from softtwin.registration.priors import nodal_forces
+from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 
 from .conftest import Cantilever, cloud_on, tip_forces
 

@@ -14,10 +14,10 @@ from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.outcome import Outcome
+from softtwin.registration.parameters.nodal_forces import NodalForces, nodal_forces
 from softtwin.registration.penalties import Amplitude, Divergence, Penalty
-from softtwin.registration.priors import NodalForces, nodal_forces
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 
 from .conftest import Cantilever, cloud_on, tip_forces
 

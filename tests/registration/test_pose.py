@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softtwin.meshes.io import FileError
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose, PoseError, from_landmarks, read_landmarks, read_matrix
-from softtwin.registration.priors import PosePrior
 
 
 def _pose(rng: np.random.Generator) -> Pose:

@@ -16,11 +16,12 @@ from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.loss import Square
 from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.outcome import Outcome
+from softtwin.registration.parameters.nodal_forces import NodalForces, nodal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import NodalForces, PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar, register_sequence
-from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.result import Registration
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces

@@ -17,11 +17,12 @@ from softtwin.registration.forward import reduce_model
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Huber
+from softtwin.registration.parameters.nodal_forces import nodal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import PosePrior, nodal_forces
 from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import prepare
-from softtwin.registration.residuals import SurfaceDistance, expected_distance
+from softtwin.registration.surface_distance import SurfaceDistance, expected_distance
 from softtwin.registration.thinning import thinned
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -81,7 +82,7 @@ def test_all_coefficients_pass_the_taylor_test(body: Body, observed: SurfaceDist
     prior = PosePrior(Pose.identity(), body.points.mean(axis=0))
     model = reduce_model(Cantilever(body), observed.nodes, forces.basis)
     cloud = cloud_on(body, np.zeros_like(body.points), 80, rng, noise=5e-3)
-    problem = Problem(model, observed, forces, prior, cloud, LogNormalPrior(1e-3, 1.0))
+    problem = Problem.of(model, observed, cloud, LogNormalPrior(1e-3, 1.0), (forces, prior))
     here = np.concatenate([0.02 * rng.standard_normal(forces.size), rng.standard_normal(6)])
     along = np.concatenate([0.02 * rng.standard_normal(forces.size), rng.standard_normal(6)])
     start = problem.evaluation(here)
@@ -133,7 +134,7 @@ def test_what_is_yet_to_be_explained_is_no_noise_of_the_points(body: Body, obser
     cantilever = Cantilever(body)
     model = reduce_model(cantilever, observed.nodes, forces.basis)
     cloud = cloud_on(body, cantilever.solve(tip_forces(body, (0.0, 0.4, 0.8))).displacement, 200, rng, noise=1e-3)
-    problem = Problem(model, observed, forces, None, cloud, LogNormalPrior(1e-3, 1.5))
+    problem = Problem.of(model, observed, cloud, LogNormalPrior(1e-3, 1.5), (forces,))
     rest = problem.evaluation(np.zeros(forces.size))
     local = LocalModel(problem, rest, Huber(), rest.match.rms, graduation=1.0)
     assert local.is_graduated and local.own < 0.5 * local.noise

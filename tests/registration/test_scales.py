@@ -16,20 +16,21 @@ from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Huber, Loss, Square, Tukey, robust_deviation
 from softtwin.registration.options import NOISE
-from softtwin.registration.policy import POLICY
-from softtwin.registration.pose import Pose
-from softtwin.registration.prepared import Prepared
-from softtwin.registration.priors import (
+from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
+from softtwin.registration.parameters.discrepancy import ModelError
+from softtwin.registration.parameters.nodal_forces import (
     LikelihoodInformed,
-    ModelError,
     NodalForces,
-    PosePrior,
     contact,
     localised,
     nodal_forces,
 )
+from softtwin.registration.parameters.pose import PosePrior
+from softtwin.registration.policy import POLICY
+from softtwin.registration.pose import Pose
+from softtwin.registration.prepared import Prepared
 from softtwin.registration.problem import Problem
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 
 from .conftest import Cantilever, cloud_on, tip_forces
 from .test_model_error import patterns
@@ -96,12 +97,11 @@ def problem(body: Body, rng: np.random.Generator, **given: Any) -> Problem:
     known: dict[str, Any] = {
         "model": reduce_model(model, observed.nodes, forces.basis),
         "observed": observed,
-        "forces": forces,
-        "pose": None,
         "cloud": cloud_on(body, truth, 300, rng, 1e-3),
         "noise": LogNormalPrior(1e-3, 0.0),
+        "blocks": (forces, *given.pop("blocks", ())),
     }
-    return Problem(**{**known, **given})
+    return Problem.of(**{**known, **given})
 
 
 def settled(given: Problem) -> LocalModel:
@@ -123,16 +123,16 @@ def test_a_scale_that_is_known_stays(body: Body, rng: np.random.Generator) -> No
 def test_without_data_the_posterior_is_the_prior(body: Body, rng: np.random.Generator) -> None:
     """All points are outliers: each block of unknowns keeps its own variance, each scale its median."""
     observed = SurfaceDistance(body, body.surfaces["observed"])
-    error = ModelError.of(patterns(body), observed)
+    error = ModelError(patterns(body), observed)
     pose = PosePrior(Pose.identity(), body.points.mean(axis=0))
     far = cloud_on(body, np.full_like(body.points, 5.0), 50, rng)
-    given = problem(body, rng, cloud=far, pose=pose, error=error, shared=observed.modes, noise=NOISE)
+    given = problem(body, rng, cloud=far, blocks=(pose, error, CorrelatedNoise(observed.modes)), noise=NOISE)
     local = LocalModel(given, given.evaluation(np.zeros(given.size)), Tukey(), 1e-3)
     assert not local.weights.any()
     found, hyperprior = local.posterior(), given.hyperprior
     np.testing.assert_allclose(local.eta, hyperprior.median, atol=0.05)
     shared = POLICY.shared_size**2 * np.exp(observed.modes.spread(local.scales.length)[0])
-    variances = [np.full(given.forces.size, 0.05**2), np.ones(6 + 2), np.exp(error.rest_logs), np.tile(shared, 3)]
+    variances = [np.full(given.forces.size, 0.05**2), np.ones(6 + 2), np.exp(error.rest.logs), np.tile(shared, 3)]
     np.testing.assert_allclose(np.diag(found.covariance), np.concatenate(variances), rtol=0.02)
     off = found.covariance - np.diag(np.diag(found.covariance))
     np.testing.assert_allclose(off, 0.0, atol=1e-12)
@@ -167,7 +167,7 @@ def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(body: Body, rng: np.ra
 
     def mean(scale: float) -> Floats:
         forces = replace(local.problem.forces, scale=LogNormalPrior(scale, 0.0))
-        known = replace(local.problem, forces=forces)
+        known = local.problem.with_forces(forces)
         held = LocalModel(known, local.evaluation, Square(), local.noise, own=local.own)
         return held.evaluation.coefficients - held.solved(held.gradient[:, None])[:, 0]
 

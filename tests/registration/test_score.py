@@ -13,11 +13,12 @@ from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import SHARED, LogNormalPrior
 from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Square
-from softtwin.registration.priors import nodal_forces
+from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
+from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.residuals import SurfaceDistance
 from softtwin.registration.score import by_rigid_motion, by_scale, gain_by_shared_noise, score
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Code, Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces
@@ -113,8 +114,8 @@ def evidence_with(local: LocalModel, problem: Problem, size: float, length: floa
     data = local.jacobian @ local.evaluation.coefficients - local.problem.residuals(local.evaluation, local.own)
     covariance = np.diag(local.deviations**2) + local.jacobian / local.precision @ local.jacobian.T
     assert problem.shared is not None
-    modes = problem.by_shared_noise(local.evaluation)
-    covariance += size**2 * modes * np.exp(np.tile(problem.shared.spread(length)[0], 3)) @ modes.T
+    modes = problem.shared.by_points(local.evaluation)
+    covariance += size**2 * modes * np.exp(np.tile(problem.shared.modes.spread(length)[0], 3)) @ modes.T
     return -0.5 * float(np.linalg.slogdet(covariance)[1] + data @ np.linalg.solve(covariance, data))
 
 
@@ -123,7 +124,7 @@ def least_squares(registrar: Registrar, cloud: np.ndarray) -> tuple[LocalModel, 
     options = replace(registrar.options, solver=GaussNewton(losses=(Square(),)), correlated=False)
     found = Registrar(registrar.model, registrar.observed, registrar.forces, options).register(cloud)
     assert found.local is not None
-    return found.local, replace(found.problem, shared=registrar.observed.modes)
+    return found.local, found.problem.with_shared(CorrelatedNoise(registrar.observed.modes))
 
 
 def test_what_shared_noise_may_explain_is_known_before_it_is_sought(registrar: Registrar) -> None:

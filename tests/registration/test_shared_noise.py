@@ -12,10 +12,12 @@ from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
 from softtwin.registration.options import RegistrationOptions, SparseLocalisation
+from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
+from softtwin.registration.parameters.nodal_forces import nodal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 
 from .conftest import Cantilever, cloud_on, seen_from_above, tip_forces
 
@@ -54,7 +56,7 @@ def test_residuals_have_the_derivative_that_they_say(body: Body, rng: np.random.
     prior = PosePrior(Pose.identity(), body.points.mean(axis=0)) if has_pose else None
     found = registrar(body, prior).register(shaken(cloud_on(body, truth(body), 300, rng), rng))
     problem, at = found.problem, found.evaluation
-    only, part = np.zeros(problem.size), problem.noise_part
+    only, part = np.zeros(problem.size), problem.part(CorrelatedNoise)
     only[part] = 1e-3 * rng.standard_normal(part.stop - part.start)
     moved = problem.residuals(problem.evaluation(at.coefficients + only, at), OWN) - problem.residuals(at, OWN)
     np.testing.assert_allclose(problem.jacobian(at) @ only, moved, atol=1e-9)

@@ -15,10 +15,11 @@ from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import RegistrationOptions, SparseLocalisation
 from softtwin.registration.outcome import Outcome
+from softtwin.registration.parameters.nodal_forces import nodal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
-from softtwin.registration.priors import PosePrior, nodal_forces
 from softtwin.registration.registrar import Registrar, prepare
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.uncertainty import Uncertainty, unseen_response
 
 from .conftest import Cantilever, cloud_on

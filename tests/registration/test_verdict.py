@@ -9,9 +9,9 @@ from softtwin.meshes.body import Body
 from softtwin.registration.checks import shared, thickness
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.options import expected_force
-from softtwin.registration.priors import nodal_forces
+from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.registrar import Registrar, prepare
-from softtwin.registration.residuals import SurfaceDistance
+from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Verdict
 
 from .conftest import Cantilever, cloud_on, tip_forces

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
+from scipy.special import chdtrc
 
-from .loss import Huber
-from .residuals import Correspondence, SurfaceDistance
+from ..evaluation import Evaluation, Slopes
+from ..loss import Huber, Loss
+from ..surface_distance import Correspondence, SurfaceDistance
+from ..verdict import Check, Code, checked, of_several
+from .term import ResidualTerm
 
 Floats = NDArray[np.float64]
-LOSS = Huber()  # a landmark may have been taken for another
+_LOSS = Huber()  # a landmark may have been taken for another
+_MARK_OFF = 4.0  # deviations of a landmark's place; three axes together are beyond it once in a thousand
 _REACH = 0.05  # of the body's size: further off the observed side a point is none of it
 
 
 @dataclass(frozen=True, eq=False)
-class LandmarkPairs:
+class LandmarkPairs(ResidualTerm):
     """Points of the observed side at rest, and where each of them is now.
 
     Args:
@@ -66,6 +71,30 @@ class LandmarkPairs:
     def __len__(self) -> int:
         return len(self.places)
 
-    def rows(self, observed: SurfaceDistance) -> csr_array:
-        """Derivative of the points' coordinates by the displacement of the observed nodes, (3l, 3m)."""
-        return observed.rows_by_axes(self.closest_points)
+    @property
+    def loss(self) -> Loss:
+        """See `ResidualTerm.loss`."""
+        return _LOSS
+
+    def values(self, at: Evaluation, held: Correspondence | None = None) -> Floats:
+        """Coordinates of the landmarks less where they were found, over their deviation, (3l,), body's axes."""
+        off = at.observed.moved_closest_points(self.closest_points, at.positions) - at.in_body(self.places)
+        return (off / self.deviation).ravel()
+
+    def slopes(self, at: Evaluation, held: Correspondence | None = None) -> Slopes:
+        """See `ResidualTerm.slopes`."""
+        axes = np.tile(np.eye(3) / self.deviation, (len(self), 1))
+        rows = at.observed.rows_by_axes(self.closest_points) / self.deviation
+        return Slopes(rows, axes, np.repeat(at.in_body(self.places), 3, axis=0))
+
+    def checks(self, at: Evaluation) -> Iterator[Check]:
+        """Landmarks that lie far from where they were found: one was taken for another, or the state is another."""
+        off = np.linalg.norm(self.values(at).reshape(-1, 3), axis=1)
+        number, largest = int(off.argmax()), float(off.max())
+        away = f"landmark {number} lies {1e3 * self.deviation * largest:.1f} mm from where it was found"
+        law = (
+            f"largest of {len(off)} lengths of three normal deviations",
+            of_several(float(chdtrc(3, largest**2)), len(off)),
+        )
+        subject = f"landmark {number}"
+        yield checked(Code.LANDMARKS, largest, _MARK_OFF, away, unit="deviations", law=law, subject=subject)

@@ -1,7 +1,8 @@
-"""The unknowns of a registration, in blocks with priors: nodal forces through few directions, and the pose."""
+"""Unknown nodal forces through few directions: which of them a cloud informs, and where forces are sought again."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -11,25 +12,25 @@ from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.embedding import outer, outer_nodes
+from softtwin.meshes.embedding import outer_nodes
 
-from .forward import Discrepancy, ReducedModel
-from .hyperparameters import LogNormalPrior
-from .policy import POLICY
-from .pose import Pose
-from .residuals import SurfaceDistance
-from .surface_modes import SurfaceModes
+from ..evaluation import Evaluation, Slopes
+from ..forward import ReducedModel
+from ..hyperparameters import FORCE as SCALE
+from ..hyperparameters import LogNormalPrior
+from ..policy import POLICY
+from ..surface_distance import SurfaceDistance
+from .block import ParameterBlock
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _SMALLEST_VARIANCE = 1e-5  # of a pattern of forces, relative to the largest: rougher ones are left out
-_SMOOTHNESS, _CARRIED = 1.5, 0.9  # of what patterns of the model's error leave out, and part of its variance
 _TANGENTIAL = 0.5  # weight of movements along the observed side: they become normal where it turns
 FORCE = LogNormalPrior(0.01, 2.0, minimum=1e-5)
 
 
 @dataclass(frozen=True, eq=False)
-class NodalForces:
+class NodalForces(ParameterBlock):
     """Nodal forces as a linear function of coefficients, independent and of one scale beforehand.
 
     Args:
@@ -54,6 +55,33 @@ class NodalForces:
     def size(self) -> int:
         """Number of coefficients, k."""
         return self.patterns.shape[1]
+
+    def hyperpriors(self, observed: SurfaceDistance) -> Mapping[int, LogNormalPrior]:
+        """Of the coefficients' standard deviation."""
+        return {SCALE: self.scale if self.size else replace(self.scale, spread=0.0)}
+
+    def log_variances(self, eta: Floats) -> tuple[float, Mapping[int, float]]:
+        """See `ParameterBlock.log_variances`."""
+        return 2.0 * float(eta[SCALE]), {SCALE: 2.0}
+
+    def columns(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+        """See `ParameterBlock.columns`."""
+        return at.state.jacobian(slopes.rows)
+
+    def pulled(self, at: Evaluation, own: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
+        """See `ParameterBlock.pulled`: by the adjoint state."""
+        full = np.zeros_like(at.observed.body.points)
+        full[at.observed.nodes] = (slopes.rows.T @ cotangent).reshape(-1, 3)
+        found: Floats = at.stiffness_scaling * (at.state.full.vjp(full).ravel() @ self.basis)
+        return found
+
+    def moved(self, at: Evaluation, change: Floats, every: int) -> Floats:
+        """See `ParameterBlock.moved`."""
+        return at.state.moved(change, every)
+
+    def full_columns(self, at: Evaluation, own: Floats) -> Floats | None:
+        """See `ParameterBlock.full_columns`."""
+        return at.stiffness_scaling * at.state.full.jvp(self.basis) if self.size else None
 
     @cached_property
     def basis(self) -> Floats:
@@ -251,126 +279,3 @@ def _observing_rows(observed: SurfaceDistance) -> csr_array:
     columns = np.repeat((3 * np.arange(count)[:, None] + np.arange(3))[:, None, :], 3, axis=1)
     indptr = np.arange(0, 9 * count + 1, 3)
     return observed.by_nodes(csr_array((blocks.ravel(), columns.ravel(), indptr), shape=(3 * count, 3 * count)))
-
-
-@dataclass(frozen=True, eq=False)
-class PosePrior:
-    """An unknown pose near an expected one.
-
-    Args:
-        mean: the pose expected.
-        centre: of the turn, in the body's coordinates, (3,), metres.
-        rotation_deviation: standard deviation of the turn about each axis, radians.
-        translation_deviation: standard deviation of the shift along each axis, metres.
-        is_said: the expected pose is the one that results are told in: what is found beside it counts as displacement.
-    """
-
-    mean: Pose
-    centre: Floats
-    rotation_deviation: float = np.deg2rad(5.0)
-    translation_deviation: float = 0.01
-    is_said: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("rotation_deviation", "translation_deviation"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f"PosePrior.{name}: expected a positive deviation, got {getattr(self, name)}.")
-
-    @property
-    def deviations(self) -> Floats:
-        """Of turn and shift, (6,)."""
-        return np.repeat([self.rotation_deviation, self.translation_deviation], 3)
-
-    def pose(self, coefficients: Floats) -> Pose:
-        """The pose for coefficients of unit variance, (6,)."""
-        return self.mean.moved(self.deviations * coefficients, self._pivot)
-
-    def jacobian(self, coefficients: Floats, points: Floats) -> Floats:
-        """Derivative of where the camera sees points by the coefficients, (p, 3, 6), metres, on the camera's axes.
-
-        Args:
-            coefficients: of unit variance, (6,).
-            points: in the body's coordinates, (p, 3), metres.
-        """
-        moved = self.mean.moved_jacobian(points, self.deviations * coefficients, self._pivot)
-        return moved.reshape(-1, 3, 6) * self.deviations
-
-    @property
-    def _pivot(self) -> Floats:
-        """The centre of the turn where the expected pose puts it, (3,)."""
-        return self.mean.apply(self.centre[None])[0]
-
-
-@dataclass(frozen=True, eq=False)
-class ModelError:
-    """What the forward model may get wrong, as unknowns of unit variance (Kennedy and O'Hagan 2001).
-
-    Args:
-        discrepancy: of the model, for a largest displacement of one metre.
-        observed: rows of its modes at the observed nodes, (3p, m).
-        left_out: its rest there, (p,).
-        size: largest displacement that is reckoned with, metres.
-        rest_modes: of the observed side, in which what the patterns leave out varies over it.
-        rest_logs: logarithms of their variances, for a field of unit variance.
-    """
-
-    discrepancy: Discrepancy
-    observed: Floats
-    left_out: Floats
-    size: float
-    rest_modes: SurfaceModes
-    rest_logs: Floats
-
-    @classmethod
-    def of(cls, discrepancy: Discrepancy, observed: SurfaceDistance) -> ModelError:
-        """For a largest displacement of one metre.
-
-        A field of Matérn's covariance on an area A is independent at (2 nu + 1) A kappa^2 / (4 pi nu^2) places, where
-        kappa^2 = 2 nu / l^2: that is tr(C)^2 / tr(C^2) in its modes.
-
-        Args:
-            discrepancy: of the model.
-            observed: the observed side.
-        """
-        nodes, whole = observed.nodes, outer(observed.body).rest
-        rows = (3 * nodes[:, None] + np.arange(3)).ravel()
-        corners = whole.points[whole.triangles]
-        area = (
-            0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-        )
-        modes = observed.modes
-        nu = _SMOOTHNESS
-        base = 4.0 * np.pi * nu**2 * discrepancy.places / ((2.0 * nu + 1.0) * area)
-        logs, _ = modes.spread(np.sqrt(2.0 * nu / base), nu)
-        carried = np.cumsum(np.exp(logs))
-        kept = min(len(logs), 1 + int(np.searchsorted(carried, _CARRIED)))
-        patterns = np.ascontiguousarray(discrepancy.modes[rows])
-        return cls(discrepancy, patterns, discrepancy.rest[nodes], 1.0, modes.leading(kept), logs[:kept])
-
-    @property
-    def count(self) -> int:
-        """Number of unknowns."""
-        return self.observed.shape[1]
-
-    @cached_property
-    def rest(self) -> Floats:
-        """Standard deviation of an observed node's distance by what the modes leave out, (p,), metres."""
-        return self.size * self.left_out
-
-    @cached_property
-    def distance_deviation(self) -> Floats:
-        """The same of a distance to the surface, where all three components of it lie across that, (p,), metres."""
-        found: Floats = np.sqrt(POLICY.discrepancy_along_normal) * self.rest
-        return found
-
-    def jacobian(self, rows: csr_array | Floats) -> Floats:
-        """Derivative of linear functions of the observed nodes' displacement, (q, m), for rows (q, 3p)."""
-        return self.size * (rows @ self.observed)
-
-    def field(self, coefficients: Floats) -> Floats:
-        """What is to be added to the model's displacement, (n, 3), metres."""
-        return (self.discrepancy.modes @ (self.size * coefficients)).reshape(-1, 3)
-
-    def observed_field(self, coefficients: Floats, every: int = 1) -> Floats:
-        """The same at the observed nodes alone, one of so many, (p, 3)."""
-        return self.observed.reshape(-1, 3, self.count)[::every] @ (self.size * coefficients)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-
-from .parameter_blocks import ParameterBlocks
 
 Floats = NDArray[np.float64]
 _ALONE = 0.9  # of an unknown's variance beforehand lies in what is not told: it is one by itself
@@ -15,7 +13,7 @@ _NAMED = 0.3  # of the largest share: who has less is not what a combination is 
 
 
 def uninformed(
-    parameter_blocks: ParameterBlocks, names: Sequence[str], covariance: Floats, variance_reduction: float
+    shares: Callable[[Floats], Floats], names: Sequence[str], covariance: Floats, variance_reduction: float
 ) -> tuple[list[str], list[str]]:
     """Unknowns that a cloud does not tell, and combinations of others that it does not tell either.
 
@@ -24,7 +22,7 @@ def uninformed(
     covariance, since beforehand it is one.
 
     Args:
-        parameter_blocks: the unknowns.
+        shares: how far each unknown goes along a direction of the coefficients, (count,): see `InputBlocks.shares`.
         names: one for each coefficient.
         covariance: of the coefficients after the cloud, (count, count).
         variance_reduction: least part of a direction's variance that a cloud must take away.
@@ -40,7 +38,7 @@ def uninformed(
     for vector in vectors[:, values > 1.0 - variance_reduction].T:
         direction = np.zeros(len(covariance))
         direction[rest] = vector
-        grown, shrunk = _sides(names, parameter_blocks.shares(direction))
+        grown, shrunk = _sides(names, shares(direction))
         (combined if len(grown) + len(shrunk) > 1 else alone).append(_in_words(grown, shrunk))
     return alone, combined
 
