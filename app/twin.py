@@ -313,7 +313,7 @@ class Twin:
         points = Cloud.of(cloud).array()  # rows of zeros are none before they are turned
         if isinstance(camera, Pose):
             back = camera.inverse()
-            return replace(run(self.registrar(zone), turned(points, back.rotation, back.translation)), pose=camera)
+            return run(self.registrar(zone), turned(points, back.rotation, back.translation)).seen_from(camera)
         assert camera != "align"
         return run(self.registrar(zone, camera), points)
 

@@ -77,7 +77,7 @@ class ContactRegistrar:
         if not draft.judgement.is_usable:
             return replace(draft, seconds=time.perf_counter() - begin)
         found = self._registrar(draft).register(cloud)
-        minimum = max(draft.scatter, self.anywhere.noise.minimum)
+        minimum = max(draft.scatter, self.anywhere.setup.noise.minimum)
         is_worse = found.scatter > _WORSE * minimum
         reason = (
             f"one contact does not explain the cloud: points lie {1e3 * found.scatter:.2f} mm from the surface, "
@@ -111,8 +111,8 @@ class ContactRegistrar:
             known_forces(body, anywhere.forces.scale),
             options,
             pose=anywhere.pose,
-            expectations=anywhere.expectations,
+            expectations=anywhere.setup.expectations,
             inputs=InputBlocks(body, {}, (contact,)),
-            blocks=anywhere.blocks,
+            blocks=anywhere.setup.blocks,
             modulus_deviation=anywhere.modulus_deviation,
         )

@@ -11,9 +11,8 @@ from scipy.stats import chi2
 
 from .evaluation import Evaluation
 from .forward import State
-from .gauss_newton import IterationRecord
+from .gauss_newton import IterationRecord, SolverResult
 from .local_model import LocalModel
-from .loss import REJECTED
 from .options import NOISE
 from .outcome import Outcome
 from .parameters.block import Estimate
@@ -28,94 +27,68 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Registration:
-    """One registered cloud.
+class Moved:
+    """How the organ has moved, and by which forces.
 
     Args:
-        prepared: the forces' basis that its coefficients belong to.
-        evaluation: where the solver ended; the next frame starts there.
-        forces: nodal forces, (n, 3), newtons.
         state: the body's state as the model has it, with its derivatives.
         correction: what the cloud asks for beside it within what the model is known to get wrong, (n, 3), metres; with
             it what a pose that was said to be known is off by.
-        discrepancy_scale: factor found of the discrepancy's prior standard deviation; 1 where none is known.
         pose: from the body's coordinates to the cloud's.
         pose_correction: what a pose that was said to be known is off by: a motion in the body's coordinates.
+        forces: nodal forces, (n, 3), newtons.
         net_force: (3,), newtons.
         net_force_covariance: given the noise found and the prior, (3, 3), newtons^2.
-        noise: standard deviation of a point's distance that was found, metres.
-        force_scale: standard deviation of the force coefficients that was found, newtons.
-        rms_distance: of the cloud to the registered surface, metres, without the outliers.
-        outliers: share of the points that pulled nothing: no other figure of the fit counts them.
-        informed: number of likelihood-informed directions of force and pose.
-        points: points that were used, after thinning.
-        outcome: how the solver ended.
+    """
+
+    state: State
+    correction: Floats
+    pose: Pose
+    pose_correction: Pose
+    forces: Floats
+    net_force: Floats
+    net_force_covariance: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """One registered cloud: the state, its posterior, the verdict, and how it came about.
+
+    Args:
+        moved: how the organ has moved.
+        solved: where the solver ended, with the posterior; the next frame starts there.
         judgement: whether the result can be used, and why not.
-        evaluations: forward solves.
+        prepared: the forces' basis that its coefficients belong to.
         seconds: wall time.
-        trace: one entry an iteration.
-        problem: what was solved, for the cloud and the model's error as they were taken in the end.
-        posterior: of the coefficients.
-        local: the objective's model there; None for a result that was put together otherwise.
         draft: what a faster model had found, where this one went on from there.
     """
 
-    prepared: Prepared
-    evaluation: Evaluation
-    forces: Floats
-    state: State
-    correction: Floats
-    discrepancy_scale: float
-    pose: Pose
-    pose_correction: Pose
-    net_force: Floats
-    net_force_covariance: Floats
-    noise: float
-    force_scale: float
-    rms_distance: float
-    outliers: float
-    informed: float
-    points: int
-    outcome: Outcome
+    moved: Moved
+    solved: SolverResult
     judgement: Judgement
-    evaluations: int
+    prepared: Prepared
     seconds: float
-    trace: tuple[IterationRecord, ...]
-    problem: Problem
-    posterior: Posterior
-    local: LocalModel | None = None
     draft: Registration | None = None
 
     def with_check(self, check: Check) -> Registration:
         """The same with a check more; what is refused stays so."""
         return replace(self, judgement=self.judgement.with_check(check))
 
-    @property
-    def coefficients(self) -> Floats:
-        """Of forces, pose, conditions and model error, (k,)."""
-        return self.evaluation.coefficients
+    def seen_from(self, pose: Pose) -> Registration:
+        """The same of a cloud that was brought to the body by a pose which is exact."""
+        return replace(self, moved=replace(self.moved, pose=pose))
+
+    # ------------------------------------------------------------------ how it has moved
 
     @property
-    def eta(self) -> Floats | None:
-        """Logarithms of the hyperparameters found, (5,); None for a result that was put together otherwise."""
-        return None if self.local is None else self.local.eta
+    def state(self) -> State:
+        """The body's state as the model has it; see `Moved`."""
+        return self.moved.state
 
     @property
-    def shared_noise(self) -> tuple[float, float] | None:
-        """Size and length of the noise that neighbours share, metres; None where it is less than any camera's."""
-        if self.local is None or self.problem.shared is None or self.local.scales.shared < NOISE.minimum:
-            return None
-        return self.local.scales.shared, self.local.scales.length
-
-    @cached_property
-    def scatter(self) -> float:
-        """Standard deviation of a point's distance with what neighbours share of its noise, metres."""
-        return float(np.sqrt(self.noise**2 + np.mean(self.problem.shared_noise(self.evaluation) ** 2)))
-
-    @property
-    def unknown_forces(self) -> Floats:
-        """Nodal forces of the basis, (n, 3), without those of conditions: newtons on a body as stiff as expected."""
-        return self.prepared.forces.forces(self.coefficients[self.problem.force_part])
+    def correction(self) -> Floats:
+        """What the cloud asks for beside it, (n, 3), metres; see `Moved`."""
+        return self.moved.correction
 
     @property
     def displacement(self) -> Floats:
@@ -123,9 +96,134 @@ class Registration:
         return self.state.displacement + self.correction
 
     @property
+    def pose(self) -> Pose:
+        """From the body's coordinates to the cloud's."""
+        return self.moved.pose
+
+    @property
+    def pose_correction(self) -> Pose:
+        """What a pose that was said to be known is off by."""
+        return self.moved.pose_correction
+
+    @property
+    def forces(self) -> Floats:
+        """Nodal forces, (n, 3), newtons."""
+        return self.moved.forces
+
+    @property
+    def unknown_forces(self) -> Floats:
+        """Nodal forces of the basis, (n, 3), without those of inputs: newtons on a body as stiff as expected."""
+        return self.prepared.forces.forces(self.coefficients[self.problem.force_part])
+
+    @property
+    def net_force(self) -> Floats:
+        """(3,), newtons."""
+        return self.moved.net_force
+
+    @property
+    def net_force_covariance(self) -> Floats:
+        """Given the noise found and the prior, (3, 3), newtons^2."""
+        return self.moved.net_force_covariance
+
+    @property
     def net_force_deviation(self) -> Floats:
         """Standard deviation of each component of the net force, (3,), newtons."""
         return np.sqrt(np.diag(self.net_force_covariance))
+
+    # ------------------------------------------------------------------ where the solver ended
+
+    @property
+    def problem(self) -> Problem:
+        """What was solved, for the cloud and the model's error as they were taken in the end."""
+        return self.solved.local.problem
+
+    @property
+    def local(self) -> LocalModel:
+        """The objective's model there."""
+        return self.solved.local
+
+    @property
+    def evaluation(self) -> Evaluation:
+        """The problem at the coefficients found."""
+        return self.solved.evaluation
+
+    @property
+    def posterior(self) -> Posterior:
+        """Of the coefficients."""
+        return self.solved.posterior
+
+    @property
+    def coefficients(self) -> Floats:
+        """Of all parameter blocks, (k,)."""
+        return self.evaluation.coefficients
+
+    @property
+    def eta(self) -> Floats:
+        """Logarithms of the hyperparameters found, (5,)."""
+        return self.local.eta
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of a point's distance that was found, metres."""
+        return self.posterior.scales.noise
+
+    @property
+    def force_scale(self) -> float:
+        """Standard deviation of the force coefficients that was found, newtons."""
+        return self.posterior.scales.force
+
+    @property
+    def discrepancy_scale(self) -> float:
+        """Factor found of the discrepancy's prior standard deviation; 1 where none is known."""
+        return self.posterior.scales.discrepancy
+
+    @property
+    def informed(self) -> float:
+        """Number of likelihood-informed directions of force and pose."""
+        return self.posterior.informed
+
+    @property
+    def rms_distance(self) -> float:
+        """Root mean square distance of the cloud to the registered surface, metres, without the outliers."""
+        return self.solved.rms_distance
+
+    @property
+    def points(self) -> int:
+        """Points that were used, after thinning."""
+        return len(self.problem.cloud)
+
+    @property
+    def outliers(self) -> float:
+        """Share of the points that pulled nothing: no other figure of the fit counts them."""
+        return float(np.mean(~self.solved.is_kept))
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the solver ended."""
+        return self.solved.outcome
+
+    @property
+    def evaluations(self) -> int:
+        """Forward solves."""
+        return self.solved.evaluations
+
+    @property
+    def trace(self) -> tuple[IterationRecord, ...]:
+        """One entry an iteration."""
+        return self.solved.trace
+
+    @property
+    def shared_noise(self) -> tuple[float, float] | None:
+        """Size and length of the noise that neighbours share, metres; None where it is less than any camera's."""
+        scales = self.posterior.scales
+        if self.problem.shared is None or scales.shared < NOISE.minimum:
+            return None
+        return scales.shared, scales.length
+
+    @cached_property
+    def scatter(self) -> float:
+        """Standard deviation of a point's distance with what neighbours share of its noise, metres."""
+        return float(np.sqrt(self.noise**2 + np.mean(self.problem.shared_noise(self.evaluation) ** 2)))
 
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -168,8 +266,7 @@ class Registration:
     @property
     def explained(self) -> Floats:
         """The points used without these, (q, 3), metres, in the coordinates in which positions are told."""
-        points, local = self.problem.cloud, self.local
-        kept = points if local is None else points[local.weights >= REJECTED]
+        kept = self.problem.cloud[self.solved.is_kept]
         return kept if self.problem.pose is None else self.pose.inverse().apply(kept)
 
     @property

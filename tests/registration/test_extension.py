@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -172,7 +172,8 @@ def test_growth_is_found_beside_the_forces(body: Body, rng: np.random.Generator,
     observed = SurfaceDistance(body, body.surfaces["observed"])
     plain, made = registrar(body), registrar(body, blocks=(Growth(observed, 0.05),))
     if solver == "lbfgs":
-        made.options = RegistrationOptions(solver=LBFGS(), localisation=SparseLocalisation(rounds=0))
+        options = RegistrationOptions(solver=LBFGS(), localisation=SparseLocalisation(rounds=0))
+        made.setup = replace(made.setup, options=options)
     without, found = plain.register(cloud), made.register(cloud)
     (growth,) = found.estimates
     assert growth.name == "growth" and found.judgement.is_usable

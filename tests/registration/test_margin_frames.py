@@ -71,7 +71,7 @@ def independent(found: Registration) -> Registration:
     local = found.local
     assert local is not None
     there = LocalModel(found.problem, found.evaluation, Square(), local.noise, starts=[local.eta], own=local.own)
-    return replace(found, posterior=there.posterior(), local=there)
+    return replace(found, solved=replace(found.solved, posterior=there.posterior(), local=there))
 
 
 @pytest.mark.parametrize("force", [1e-3, 5e-3, 1e-1])

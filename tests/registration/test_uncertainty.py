@@ -92,7 +92,7 @@ def test_what_is_not_known_has_no_margin(body: Body, rng: np.random.Generator) -
     made = registrar(body)
     found = made.register(cloud_on(body, np.zeros_like(body.points), 100, rng, NOISE))
     broken = replace(found.posterior, covariance=np.full_like(found.posterior.covariance, np.nan))
-    unknown = replace(found, posterior=broken).uncertainty
+    unknown = replace(found, solved=replace(found.solved, posterior=broken)).uncertainty
     assert np.isinf(unknown.deviation).all() and np.isinf(unknown.margin()).all()
     inner = embed(body, np.array([[0.6, 0.1, 0.1]]))
     assert np.isinf(unknown.margin(inner)).all()
@@ -226,7 +226,7 @@ def replace_options(made: Registrar) -> Registrar:
 def test_who_is_called_converged_has_no_step_left(body: Body) -> None:
     """Closest points that are searched anew at the end may ask for another step: it is taken."""
     made = registrar(body)
-    made.noise = LogNormalPrior(NOISE, 1.5, minimum=1e-4)
+    made.setup = replace(made.setup, noise=LogNormalPrior(NOISE, 1.5, minimum=1e-4))
     for seed in range(40):
         rng = np.random.default_rng(seed)
         forces = made.forces.forces(FORCE * rng.standard_normal(made.forces.size))

@@ -1,0 +1,111 @@
+"""From rest: the leading directions of force first, then all; and once more for each round of gathering the forces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud import Cloud
+from ..gauss_newton import GaussNewton, SolverResult
+from ..lbfgs import LBFGS
+from ..parameters.nodal_forces import contact, localised
+from ..prepared import Prepared
+from ..problem import Problem
+from ..setup import Ended, Setup, after
+
+Floats = NDArray[np.float64]
+_LEADING = 6  # directions of force that a cold start begins with
+
+
+@dataclass(frozen=True, eq=False)
+class Localised(Ended):
+    """Where forces act, as far as a search from rest has found it, the model's error taken for noise.
+
+    Args:
+        is_settled: whether the solver has gone to the end of it.
+    """
+
+    is_settled: bool = True
+
+
+def localise(setup: Setup, points: Cloud) -> Localised:
+    """The place of the forces, from rest; where time is over before the end, as far as it was found.
+
+    Args:
+        setup: what is registered.
+        points: of the cloud.
+    """
+    prepared, rule, solver = setup.everywhere, setup.options.localisation, setup.options.solver
+    few, is_gathered = points.thinned(rule.points), rule.rounds > 0
+    begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
+    found = from_rest(setup, *begun)
+    for left in reversed(range(rule.rounds)):
+        if setup.is_hopeless(found) or setup.is_late:
+            break
+        prepared = _gathered(setup, prepared.forces.forces(found.evaluation.coefficients[: prepared.forces.size]))
+        found = after(found, from_rest(setup, few if left else points, prepared, solver))
+    return Localised(prepared, found, is_gathered)
+
+
+def from_rest(setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> SolverResult:
+    """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all.
+
+    Args:
+        setup: what is registered.
+        points: of the cloud.
+        prepared: forces.
+        solver: that ends it.
+    """
+    few, first = points.thinned(setup.options.localisation.points), prepared.leading(_LEADING)
+    rough, problem = setup.plain(few, first).unshared, setup.plain(points, prepared)
+    begun = solver.rough().solve(rough, np.zeros(rough.size))
+    start = problem.carried(begun.evaluation.coefficients, rough)
+    start[: first.forces.size] = begun.evaluation.coefficients[rough.force_part]
+    if setup.is_hopeless(begun):  # what six directions leave as far off is no state of this organ
+        solver = solver.without_steps()
+    return after(begun, solver.solve(problem, start, begun.evaluation, begun.local.eta))
+
+
+def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
+    """With all points, and with the model's error in patterns, from a result that took it for noise.
+
+    Args:
+        setup: what is registered.
+        points: of the cloud.
+        begun: where the search from rest has ended.
+    """
+    prepared, found, solver = begun.prepared, begun.found, setup.options.solver
+    if setup.is_hopeless(found):
+        solver = solver.without_steps()
+    believed = prepared if setup.error is not None else _believed(setup, prepared, found)
+    problem = setup.problem(points, believed, found.evaluation.positions, found.rms_distance)
+    is_settled = begun.is_settled and believed is prepared and len(found.evaluation.cloud) == len(points)
+    if setup.error is not None or not is_settled:
+        found = _from(problem, solver, found, problem.carried(found.evaluation.coefficients, found.local.problem))
+    wider = _believed(setup, believed, found)
+    if wider is not believed:  # seen only now that the model's error is told from noise
+        believed, problem = wider, problem.with_forces(wider.forces)
+        found = _from(problem, solver, found, found.evaluation.coefficients)
+    return Ended(believed, found)
+
+
+def _from(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResult, start: Floats) -> SolverResult:
+    return after(found, solver.solve(problem, start, found.evaluation, found.local.eta))
+
+
+def _believed(setup: Setup, prepared: Prepared, found: SolverResult) -> Prepared:
+    """The forces' size as the cloud tells it, where it can: what was expected would call a sharp pull outliers."""
+    hyperprior, noise = setup.options.hyperprior, found.local.noise
+    is_told = noise < hyperprior.clear or noise > hyperprior.loud
+    if not is_told or prepared.forces.scale.spread >= hyperprior.spread:
+        return prepared
+    return prepared.with_prior(hyperprior.spread)
+
+
+def _gathered(setup: Setup, nodal: Floats) -> Prepared:
+    """The unknown forces once more, where forces were found."""
+    body, rule = setup.model.body, setup.options.localisation
+    where = contact(setup.forces, nodal, body.points, rule.reach * body.size)
+    return setup.prepared(localised(setup.forces, where)).informed(setup.observed, rule.informed)

@@ -1,0 +1,48 @@
+"""From the last frame: its state and hyperparameters are the start; or from rest with its forces, if that is nearer."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..cloud import Cloud
+from ..evaluation import Evaluation
+from ..loss import robust_deviation
+from ..result import Registration
+from ..setup import Ended, Setup
+from .cold_start import Localised, finish, from_rest
+
+_FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
+_GLANCE = 100  # points that this is seen from
+_LEFT = 1.5  # times the noise of the frame before
+
+
+def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
+    """Where the solver ends from the frame before.
+
+    Args:
+        setup: what is registered.
+        points: of the cloud.
+        last: the frame before.
+    """
+    problem = setup.problem(points, last.prepared, last.evaluation.positions, last.rms_distance)
+    near = problem.begun(problem.carried(last.evaluation.coefficients, last.problem), last.evaluation)
+    if _is_nearer_at_rest(setup, near, last):  # the tool has let go: no way back through all states between
+        begun = from_rest(setup, points, last.prepared, setup.options.solver)
+        return finish(setup, points, Localised(last.prepared, begun))
+    solver = setup.options.solver.following()
+    return Ended(last.prepared, solver.solve(problem, near.coefficients, near, last.eta))
+
+
+def has_left(setup: Setup, found: Registration, last: Registration) -> bool:
+    """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
+    return found.scatter > _LEFT * max(last.scatter, setup.noise.minimum)
+
+
+def _is_nearer_at_rest(setup: Setup, near: Evaluation, last: Registration) -> bool:
+    """True where a cloud lies nearer to the body at rest than to what the last frame has found."""
+    far = robust_deviation(near.match.distances)
+    if far < _FAR * max(last.noise, setup.options.noise.minimum):
+        return False
+    few = near.cloud[:: max(1, len(near.cloud) // _GLANCE)]
+    rest = setup.observed.match(np.zeros_like(near.positions), few)
+    return robust_deviation(rest.distances) < far
