@@ -17,24 +17,20 @@ from scipy.special import chdtri, ndtr
 
 from softtwin.meshes.metrics import displacement_gradients
 
-from .expectations import UNLIKELY, Expectations
+from .expectations import Expectations
 from .forward import State
 from .gauss_newton import SolverResult
 from .hyperparameters import LogNormalPrior
 from .loss import REJECTED
 from .outcome import Outcome
+from .policy import ACCURACY, POLICY
 from .problem import Problem
 from .score import Score, by_rigid_motion, by_scale, score
 from .verdict import Check, Code, Judgement, Verdict, checked
 
 Floats = NDArray[np.float64]
-_NEIGHBOURS = 6
-_ASKED = 250  # points at least, whose neighbours are looked at
-_FEWEST_POINTS = 30
-_MUCH, _THIN, _ABOUT = 0.2, 0.05, 8  # share of the points that fit nowhere, thickness of a surface, neighbours for that
+_ABOUT = 8  # neighbours of a point, whose plane tells a surface
 _NEARLY_ALL = 95.0  # per cent of the cells
-_LINE = 0.02  # of a cloud's width to its length: a narrower one shows no surface
-_REFUSED_NOISE, _REFUSED_PATCHES, _REFUSED_LOAD = 1.5, 2.0, 2.0  # times the level: no use at all
 
 
 def judge(problem: Problem, found: SolverResult, state: State, expected: Expectations) -> Judgement:
@@ -73,11 +69,11 @@ def _convergence(found: SolverResult) -> Check:
 def _cloud(problem: Problem, found: SolverResult, expected: Expectations) -> Iterator[Check]:
     cloud = problem.cloud
     spread = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False) / np.sqrt(len(cloud))
-    few = f"the cloud has {len(cloud)} points; fewer than {_FEWEST_POINTS} tell little"
-    yield checked(Code.POINT_COUNT, len(cloud), _FEWEST_POINTS, few, is_minimum=True)
+    few = f"the cloud has {len(cloud)} points; fewer than {POLICY.fewest_points} tell little"
+    yield checked(Code.POINT_COUNT, len(cloud), POLICY.fewest_points, few, is_minimum=True)
     width = float(spread[1] / spread[0]) if len(cloud) >= 3 and spread[0] > 0.0 else 0.0
     narrow = "the cloud is a line or a spot: it shows no surface"
-    yield checked(Code.CLOUD_SHAPE, width, _LINE, narrow, is_minimum=True, refused=_LINE)
+    yield checked(Code.CLOUD_SHAPE, width, POLICY.line, narrow, is_minimum=True, refused=POLICY.line)
     if problem.forces.size:
         informed = found.posterior.informed
         nothing = f"the cloud tells {informed:.1f} directions of force: hardly anything"
@@ -94,7 +90,7 @@ def _fit(problem: Problem, found: SolverResult, expected: Expectations) -> Itera
         expected.noise,
         f"organ and cloud do not match: points lie {1e3 * noise:.1f} mm from the surface "
         f"(up to {1e3 * expected.noise:.1f} mm could be noise)",
-        refused=_REFUSED_NOISE * expected.noise,
+        refused=POLICY.refused * expected.noise,
         unit="m",
         law=_log_normal(noise, problem.noise),
     )
@@ -107,19 +103,19 @@ def _fit(problem: Problem, found: SolverResult, expected: Expectations) -> Itera
         expected.systematic,
         f"organ and cloud do not match: whole patches of the surface are {1e3 * systematic:.1f} mm off, which no noise "
         f"of points explains (up to {1e3 * expected.systematic:.1f} mm is let pass)",
-        refused=_REFUSED_PATCHES * expected.systematic,
+        refused=POLICY.refused * expected.systematic,
         unit="m",
     )
     outliers = float(np.mean(~found.is_kept))
     many = f"{100 * outliers:.0f} % of the points fit nowhere"
     yield checked(Code.OUTLIERS, outliers, expected.outliers, many)
-    if _MUCH < outliers <= expected.outliers:
+    if POLICY.foreign < outliers <= expected.outliers:
         thin = thickness(found.evaluation.cloud[~found.is_kept])
         other = (
             f"{100 * outliers:.0f} % of the points are a surface that is none of this organ's: something else is in "
             "the cloud"
         )
-        yield checked(Code.FOREIGN_SURFACE, thin, _THIN, other, is_minimum=True)
+        yield checked(Code.FOREIGN_SURFACE, thin, POLICY.thin, other, is_minimum=True)
 
 
 def _log_normal(value: float, prior: LogNormalPrior) -> tuple[str, float] | None:
@@ -140,10 +136,10 @@ def shared(closest_points: Floats, distances: Floats, weights: Floats) -> float:
     """
     kept = weights > REJECTED
     points, values = closest_points[kept], distances[kept]
-    count = min(_NEIGHBOURS, len(points) - 1)
+    count = min(ACCURACY.neighbours, len(points) - 1)
     if count < 1 or not values.any():
         return 0.0
-    asked = slice(None, None, max(1, len(points) // _ASKED))
+    asked = slice(None, None, max(1, len(points) // ACCURACY.asked))
     _, near = cKDTree(points).query(points[asked], k=count + 1)
     beside = values[near[:, 1:]].mean(axis=1)
     return float(np.clip((values[asked] * beside).mean() / (values**2).mean(), 0.0, 1.0))
@@ -184,7 +180,7 @@ def _state(problem: Problem, state: State, expected: Expectations) -> Iterator[C
     ratio, limit = state.extrapolation_ratio, expected.extrapolation_ratio
     if ratio is not None:
         beyond = f"the load is {ratio:.1f} times the largest that the surrogate has learned"
-        yield checked(Code.LOAD, ratio, limit, beyond, refused=_REFUSED_LOAD * limit)
+        yield checked(Code.LOAD, ratio, limit, beyond, refused=POLICY.refused * limit)
     pivots = state.negative_pivots
     if pivots is not None:
         unstable = f"the state is unstable: {pivots} negative pivots of its tangent"
@@ -211,7 +207,7 @@ def _left_out(problem: Problem, found: SolverResult) -> Iterator[Check]:
 
 def _scored(code: Code, told: Score, matters: bool, reason: str) -> Check:
     """A check by a score test; what is sure and too small to matter is passed."""
-    level = float(chdtri(len(told.estimate), UNLIKELY))
+    level = float(chdtri(len(told.estimate), POLICY.unlikely_score))
     law = f"chi-square, {len(told.estimate)} degrees of freedom", told.p_value
     made = checked(code, told.statistic, level, reason, law=law)
     return made if matters else replace(made, verdict=Verdict.ACCEPTED, level=None, reason="")

@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from .parameters.contact import Contact
 from .parameters.inputs import InputBlocks
 from .parameters.nodal_forces import known_forces
+from .policy import POLICY
 from .registrar import Registrar
 from .result import Registration
 from .verdict import Check, Code, Verdict
 
 Floats = NDArray[np.float64]
 _REACH = 0.1  # body sizes that the place may be off where forces anywhere have put it
-_WORSE = 2.0  # times the noise that forces anywhere leave, and times the least noise: one contact does not explain it
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class ContactRegistrar:
             return replace(draft, seconds=time.perf_counter() - begin)
         found = self._registrar(draft).register(cloud)
         minimum = max(draft.scatter, self.anywhere.setup.noise.minimum)
-        is_worse = found.scatter > _WORSE * minimum
+        is_worse = found.scatter > minimum / POLICY.elsewhere
         reason = (
             f"one contact does not explain the cloud: points lie {1e3 * found.scatter:.2f} mm from the surface, "
             f"with forces anywhere {1e3 * draft.scatter:.2f} mm"
@@ -88,7 +88,7 @@ class ContactRegistrar:
                 Code.CONTACT,
                 Verdict.DOUBTFUL if is_worse else Verdict.ACCEPTED,
                 found.scatter / minimum,
-                _WORSE,
+                1.0 / POLICY.elsewhere,
                 "times the distances with forces anywhere",
                 reason=reason if is_worse else "",
             )

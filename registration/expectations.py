@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from .forward import ForwardModel
 from .hyperparameters import LogNormalPrior
-
-# Turn (radians) or stretch that a linear law holds for, half of which it is off by, relative: a centimetre of movement
-# is then good to a camera's noise.
-_SMALL = 0.03
-# Chance of a score, a choice: forces that are localised by the cloud that they explain leave larger scores than
-# chi-square has. It is far below that of the other checks.
-UNLIKELY = 1e-5
+from .policy import POLICY
 
 
 @dataclass(frozen=True)
@@ -28,27 +22,24 @@ class Expectations:
         outliers: largest share of points that may be wrong.
         extrapolation_ratio: largest load relative to what the model has learned.
         informed: fewest directions that a cloud must tell, where so many are unknown.
-        pose: largest move of the pose in deviations of its prior.
-        parameter: the same of stiffness and other unknowns beside the forces.
+        unlikely: chance of a pose, of another parameter or a landmark that lies too far from where it was expected.
         gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
         discrepancy_scale: how often as large as it was seen to be what the model gets wrong may be taken.
         correction: however large beside what was seen, so little of it harms nobody: of an observed node, metres.
         minimum_variance_reduction: part of the variance of such a parameter, and of every combination of them, that a
-            cloud must take
-            away where all forces are known.
+            cloud must take away where all forces are known.
     """
 
     noise: float
     systematic: float
     movement: float
-    outliers: float = 0.4
-    extrapolation_ratio: float = 1.2
-    informed: float = 2.0
-    pose: float = 3.0
-    parameter: float = 3.0
-    discrepancy_scale: float = 1.5
+    outliers: float = field(default_factory=lambda: POLICY.outliers)
+    extrapolation_ratio: float = field(default_factory=lambda: POLICY.load)
+    informed: float = field(default_factory=lambda: POLICY.fewest_directions)
+    unlikely: float = field(default_factory=lambda: POLICY.unlikely)
+    discrepancy_scale: float = field(default_factory=lambda: POLICY.discrepancy)
     correction: float = 0.0
-    minimum_variance_reduction: float = 0.5
+    minimum_variance_reduction: float = field(default_factory=lambda: POLICY.informed)
     gradient: float = np.inf
 
     @classmethod
@@ -61,9 +52,9 @@ class Expectations:
         """
         size = model.body.size
         return cls(
-            noise=max(0.025 * size, 3.0 * noise.median),
-            systematic=max(0.005 * size, noise.median),
-            movement=0.35 * size,
-            correction=0.0005 * size,
-            gradient=_SMALL if getattr(model, "is_linear", False) else np.inf,
+            noise=max(POLICY.misfit * size, 3.0 * noise.median),
+            systematic=max(POLICY.misfit_shared * size, noise.median),
+            movement=POLICY.movement * size,
+            correction=POLICY.harmless * size,
+            gradient=POLICY.linear if getattr(model, "is_linear", False) else np.inf,
         )

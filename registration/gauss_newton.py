@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +17,12 @@ from .hyperparameters import LENGTH, SHARED
 from .local_model import LocalModel, without_shared_noise
 from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
+from .policy import ACCURACY
 from .posterior import Posterior
 from .problem import Problem
 from .score import gain_by_shared_noise
 
 Floats = NDArray[np.float64]
-_ROUGH = 15  # iterations that a start is worth
-_UNSHARED = 8  # iterations in which points far off are told, before noise that neighbours share is thought of
-_KEPT = 0.2  # a whole step that misses its promise by less: derivatives have hardly changed on its way
-_TRUSTED = 3.0  # deviations
-_NEARER = 1e-3  # part of the objective that closest points searched anew must take away to go on
-_UNCHANGED = 0.3  # times the noise: so much of a distance is not looked at
 
 
 @dataclass(frozen=True)
@@ -123,12 +118,12 @@ class GaussNewton:
     """
 
     losses: tuple[Loss, ...] = (Huber(), Tukey())
-    max_iterations: int = 40
-    settled: float = 0.2
-    enough: float = 0.3
-    handed_on: float = 1.0
-    graduation: float = 1.0
-    max_step: float = 0.05
+    max_iterations: int = field(default_factory=lambda: ACCURACY.iterations)
+    settled: float = field(default_factory=lambda: ACCURACY.settled)
+    enough: float = field(default_factory=lambda: ACCURACY.enough)
+    handed_on: float = field(default_factory=lambda: ACCURACY.handed_on)
+    graduation: float = field(default_factory=lambda: ACCURACY.graduation)
+    max_step: float = field(default_factory=lambda: ACCURACY.first_step)
     minimum_step: float = 1e-6
     trusted: float = 0.0
     is_near: bool = False
@@ -144,7 +139,7 @@ class GaussNewton:
 
     def rough(self) -> GaussNewton:
         """The same with the first loss alone, ended early: for a start."""
-        few = min(self.max_iterations, _ROUGH)
+        few = min(self.max_iterations, ACCURACY.rough_iterations)
         return replace(self, losses=self.losses[:1], settled=self.handed_on, max_iterations=few)
 
     def unsettled(self) -> GaussNewton:
@@ -153,7 +148,7 @@ class GaussNewton:
 
     def following(self) -> GaussNewton:
         """The same from the state of a frame before: closest points and scales stay the same over so short a way."""
-        return replace(self, trusted=max(self.trusted, _TRUSTED), is_near=True)
+        return replace(self, trusted=max(self.trusted, ACCURACY.trusted), is_near=True)
 
     def without_steps(self) -> GaussNewton:
         """The same, which takes any start for the end: to judge it."""
@@ -216,7 +211,7 @@ class _Search:
         if self.problem is self.whole:
             outcome = self._descend(last, options.settled)
         else:  # points far off are told first, then what neighbours share
-            outcome = self._descend(last, options.settled, _UNSHARED)
+            outcome = self._descend(last, options.settled, ACCURACY.unshared_iterations)
             self.begun, is_whole = len(self.trace), self._takes_whole(last)
             if not is_whole and outcome is not Outcome.CONVERGED:
                 outcome = self._descend(last, options.settled)
@@ -305,7 +300,7 @@ class _Search:
                 if not is_handed_on and self._lies_closer(local, loss):
                     continue
                 return refused
-            if is_handed_on and local.was_whole and abs(self.trace[-1].gain - 1.0) < _KEPT:
+            if is_handed_on and local.was_whole and abs(self.trace[-1].gain - 1.0) < ACCURACY.kept:
                 return Outcome.CONVERGED
         return Outcome.MAXIMUM_ITERATIONS
 
@@ -329,14 +324,14 @@ class _Search:
         """Search the closest points anew; True where that moves the minimum no further than the search goes."""
         before = self.evaluation.match.distances
         again = self.problem.again(self.evaluation, self.options.trusted * robust_deviation(before))
-        if np.abs(again.match.distances - before).max() >= _UNCHANGED * self.noise:
+        if np.abs(again.match.distances - before).max() >= ACCURACY.unchanged * self.noise:
             self.evaluation = again
         return local.length_for(again) < settled
 
     def _lies_closer(self, local: LocalModel, loss: Loss) -> bool:
         """Search the closest points anew where no step helps; True where a point that had walked astray lies closer."""
         again = self.problem.again(self.evaluation)
-        if local.value - local.objective(again, loss) <= _NEARER * local.value:
+        if local.value - local.objective(again, loss) <= ACCURACY.closer * local.value:
             return False
         self.evaluation = again
         return True
@@ -357,7 +352,7 @@ class _Search:
             self.limit = _next_limit(self.limit, largest, gain)
             if gain > 0.0:
                 self.evaluation = evaluation
-                if self.options.is_near and local.was_whole and abs(gain - 1.0) < _KEPT:
+                if self.options.is_near and local.was_whole and abs(gain - 1.0) < ACCURACY.kept:
                     self._at = local.moved_to(evaluation)
                 self.trace.append(
                     IterationRecord(

@@ -16,13 +16,12 @@ from .evaluation import Evaluation
 from .evidence import Evidence, LinearProblem
 from .hyperparameters import DISCREPANCY, LENGTH, NOISE, SHARED, Hyperparameters
 from .loss import Loss
+from .policy import ACCURACY
 from .posterior import Posterior
 from .problem import Problem
 from .residuals.term import ResidualTerm
 
 Floats = NDArray[np.float64]
-_ALIKE = 0.02  # of all weights: what points tell is not summed anew for a smaller change of them
-_GROUPS = 6  # of points, by how far the model's error makes them doubtful
 
 
 class LocalModel:
@@ -75,7 +74,7 @@ class LocalModel:
         self.deviations = np.hypot(self.noise, self.scales.discrepancy * self.rough)
         residuals = problem.residuals(evaluation, self.own)
         self.weights = loss.weight(residuals / self.deviations)
-        if np.abs(self.weights - self.counted).sum() > _ALIKE * self.weights.sum():
+        if np.abs(self.weights - self.counted).sum() > ACCURACY.summed * self.weights.sum():
             summed = replace(self._evidence_of(residuals, self.weights).problem, tail=self._evidence.problem.tail)
             self._evidence, self.counted = replace(self._evidence, problem=summed), self.weights
         self.precision = np.exp(-problem.prior_variances(self.eta)[0])
@@ -314,7 +313,7 @@ def _grouped(rough: Floats) -> tuple[list[NDArray[np.int64]], Floats]:
     """Points of like variance: numbers of those in each group, and the root mean square of it for each point, (p,)."""
     if not rough.any():
         return [np.arange(len(rough))], rough
-    groups = [group for group in np.array_split(np.argsort(rough), _GROUPS) if len(group)]
+    groups = [group for group in np.array_split(np.argsort(rough), ACCURACY.groups) if len(group)]
     alike = np.empty_like(rough)
     for group in groups:
         alike[group] = np.sqrt(np.mean(rough[group] ** 2))

@@ -14,16 +14,24 @@ from .gauss_newton import GaussNewton
 from .hyperparameters import LogNormalPrior
 from .lbfgs import LBFGS
 from .parameters.nodal_forces import LikelihoodInformed
+from .policy import ACCURACY, POLICY
 from .residuals.normals import NORMAL_DEVIATION
 from .surface_distance import Distance
 
-_SPREAD_ANYWHERE = (
-    0.7  # of the logarithm of a nodal force, where a cloud tells the size of forces of which most are none
-)
 _MANY = 10_000  # points: of no cloud that is left after thinning are there more
-_CLEAR, _LOUD = 2.0, 1.5  # times the least noise, times the model's error
-_CLOSE = 0.01  # reach of a surrogate's forces whose zone is unknown: with more, their doubt is larger than their error
-NOISE = LogNormalPrior(5e-4, 1.5, minimum=1e-4)  # metres; no camera is better than the least
+NOISE_MEDIAN = 5e-4  # metres: of clouds of which nobody says anything
+
+
+def usual_noise(median: float = NOISE_MEDIAN) -> LogNormalPrior:
+    """What is believed of the standard deviation of a point's distance, metres.
+
+    Args:
+        median: of it.
+    """
+    return LogNormalPrior(median, POLICY.noise_spread, minimum=POLICY.noise_minimum)
+
+
+NOISE = usual_noise()
 
 
 @dataclass(frozen=True)
@@ -37,10 +45,10 @@ class SparseLocalisation:
         points: so many of the cloud are enough, but for the last round.
     """
 
-    rounds: int = 2
-    reach: float = 0.035
+    rounds: int = field(default_factory=lambda: ACCURACY.rounds)
+    reach: float = field(default_factory=lambda: POLICY.force_reach)
     informed: LikelihoodInformed = field(default_factory=LikelihoodInformed)
-    points: int = 300
+    points: int = field(default_factory=lambda: ACCURACY.few_points)
 
     def __post_init__(self) -> None:
         if self.points < 1:
@@ -59,7 +67,7 @@ class ForceHyperprior:
 
     clear: float = 0.0
     loud: float = np.inf
-    spread: float = 1.0
+    spread: float = field(default_factory=lambda: POLICY.force_spread_told)
 
 
 @dataclass(frozen=True)
@@ -77,9 +85,9 @@ class RegistrationOptions:
         correlated: reckon with noise that neighbouring points share; see `surface_modes`.
     """
 
-    noise: LogNormalPrior = NOISE
+    noise: LogNormalPrior = field(default_factory=usual_noise)
     solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
-    maximum_points: int = 1000
+    maximum_points: int = field(default_factory=lambda: ACCURACY.points)
     localisation: SparseLocalisation = field(default_factory=SparseLocalisation)
     hyperprior: ForceHyperprior = field(default_factory=ForceHyperprior)
     distance: Distance = "surface"
@@ -110,19 +118,20 @@ def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> 
         has_zone: the nodes that may carry force are those that a tool can touch.
         has_pose: the pose is unknown.
     """
-    clear, loud = _CLEAR * NOISE.minimum, _LOUD * model.error
+    clear, loud = POLICY.force_told_below * POLICY.noise_minimum, POLICY.force_told_above * model.error
     if model.error == 0.0:
-        localisation = SparseLocalisation(rounds=0 if has_zone else SparseLocalisation.rounds, points=_MANY)
+        localisation = SparseLocalisation(rounds=0 if has_zone else ACCURACY.rounds, points=_MANY)
         return RegistrationOptions(localisation=localisation, hyperprior=ForceHyperprior(clear))
     if has_zone:
         hyperprior = ForceHyperprior(clear if has_pose else 0.0, loud)
         return RegistrationOptions(localisation=SparseLocalisation(rounds=0, points=_MANY), hyperprior=hyperprior)
     return RegistrationOptions(
-        localisation=SparseLocalisation(reach=_CLOSE), hyperprior=ForceHyperprior(loud=loud, spread=_SPREAD_ANYWHERE)
+        localisation=SparseLocalisation(reach=POLICY.force_reach_surrogate),
+        hyperprior=ForceHyperprior(loud=loud, spread=POLICY.force_spread_anywhere),
     )
 
 
 def expected_force(body: Body, young_modulus: float) -> float:
-    """Nodal force to begin with, newtons: 1 % of Young's modulus (Pa) over the square of a typical edge."""
+    """Nodal force to begin with, newtons: a part of Young's modulus (Pa) times the square of a typical edge."""
     edge = float(np.median(edge_lengths(body.points, body.cells)))
-    return 0.01 * young_modulus * edge**2
+    return POLICY.force_size * young_modulus * edge**2

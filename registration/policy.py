@@ -1,24 +1,46 @@
-"""Numbers of the registration that are choices: what each means, where it comes from, in one table.
+"""Numbers of the registration that are choices: what each means, where it comes from, in two tables.
 
-Who changes one runs `benchmarks/guards.py` before and after. Numbers that are not here yet stand at the head of the
-file that uses them.
+Answers depend on those of `POLICY`: who changes one runs `benchmarks/guards.py` before and after. Those of `ACCURACY`
+say how closely something is computed, or how much of it is looked at: with half or twice of one, answers stay what they
+were, and time changes. `benchmarks/policy.py` says of each number what happens at half and at twice its value.
+Constants of the literature (Huber's 1.345, the rules of a trust region) stand where they are used, with their source.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
 
 
-def choice(value: float, unit: str, meaning: str, source: str) -> float:
-    """A number with what a reader wants to know of it."""
+def choice(value: float, unit: str, meaning: str, source: str = "") -> float:
+    """A number with what a reader wants to know of it.
+
+    Args:
+        value: of it.
+        unit: of that; empty for none.
+        meaning: what it is.
+        source: the benchmark's row or the paper that it comes from.
+    """
     found: float = field(default=value, metadata={"unit": unit, "meaning": meaning, "source": source})
+    return found
+
+
+def count(value: int, unit: str, meaning: str, source: str = "") -> int:
+    """The same of a whole number."""
+    found: int = field(default=value, metadata={"unit": unit, "meaning": meaning, "source": source})
     return found
 
 
 @dataclass(frozen=True)
 class Policy:
-    """All of them; `dataclasses.fields` tells unit, meaning and source of each."""
+    """Choices that answers depend on; `dataclasses.fields` tells unit, meaning and source of each."""
 
+    # What is believed of the points' noise, and of what neighbours share of it.
+    noise_spread: float = choice(
+        1.5, "", "standard deviation of the logarithm of the points' noise", "robustness, noise 0.1 to 5 mm"
+    )
+    noise_minimum: float = choice(1e-4, "m", "least noise of a point: no camera is better", "robustness: clean")
     shared_size: float = choice(
         2e-6,
         "m",
@@ -49,12 +71,8 @@ class Policy:
     shared_length_minimum: float = choice(
         1.75, "edges of the surface", "least of it: shorter fields are those of the mesh", "liver_engines, remeshed"
     )
-    surface_modes: int = choice(  # type: ignore[assignment]
-        48,
-        "",
-        "modes of the observed side in which each component of it is described",
-        "misspecified, noise that neighbours share: 128 of one field along normals held 55 % of 90, not 91 %",
-    )
+
+    # What is believed of the model's error.
     discrepancy_spread: float = choice(
         0.25,
         "",
@@ -86,11 +104,22 @@ class Policy:
         "variance of a distance by what the model's patterns leave out: all of it may lie along the normal",
         "robustness, surrogate: clean; errors of a network are largest across the surface that is pulled",
     )
+
+    # What is believed of the forces.
+    force_size: float = choice(
+        0.01, "of Young's modulus times a squared edge", "median of a nodal force's size", "robustness, surrogate"
+    )
     force_spread: float = choice(
         0.35,
         "",
         "standard deviation of the logarithm of a nodal force's size: with more, forces explain noise",
         "robustness, surrogate: noise 5 mm (0.35, 0.5, 1.0: 0.52, 0.54, 0.64 mm)",
+    )
+    force_spread_told: float = choice(
+        1.0,
+        "",
+        "the same where the cloud can tell it: see `force_told_below`, `force_told_above`",
+        "robustness, reference: clean; a sharp pull of an unexpected size would be called outliers",
     )
     force_spread_anywhere: float = choice(
         0.7,
@@ -98,12 +127,153 @@ class Policy:
         "the same of a model that errs, where no zone is told: forces gathered at a small place are larger",
         "misspecified, surrogate: as it is; smaller values make it worse",
     )
+    force_told_below: float = choice(
+        2.0, "times the least noise", "a clearer cloud tells the size of the forces", "robustness, reference: clean"
+    )
+    force_told_above: float = choice(
+        1.5,
+        "times the model's error",
+        "so does one of more noise, beside which that error is small",
+        "robustness, surrogate: noise 5 mm",
+    )
     force_elsewhere: float = choice(
         0.005,
         "of the size at the place where forces were found",
         "size of forces elsewhere, where no zone is told: large ones at the place would make them free everywhere",
         "robustness, surrogate: no zone, clean; four times as much makes it worse, a fifth of it does not matter",
     )
+    force_reach: float = choice(
+        0.035, "sizes of the body", "forces within it are gathered together", "robustness, reference: no zone"
+    )
+    force_reach_surrogate: float = choice(
+        0.01,
+        "sizes of the body",
+        "the same of a model that errs: with more, the forces' doubt is larger than their error",
+        "robustness, surrogate: no zone",
+    )
+
+    # From where on a result is doubtful; refused, where that is possible, beyond `refused` times the level.
+    unlikely: float = choice(
+        2.7e-3,
+        "",
+        "chance of what lies too far from where it was expected: three standard deviations of one number",
+        "verdict, right clouds",
+    )
+    unlikely_score: float = choice(
+        1e-5,
+        "",
+        "the same of score tests: forces that are localised by the cloud that they explain leave larger ones than "
+        "chi-square has",
+        "verdict, right clouds",
+    )
+    misfit: float = choice(
+        0.025, "sizes of the body", "most of the points' noise, where three times what was expected is less", "verdict"
+    )
+    misfit_shared: float = choice(
+        0.005, "sizes of the body", "most of what neighbours share of it, where what was expected is less", "verdict"
+    )
+    movement: float = choice(0.35, "sizes of the body", "largest movement of a node", "largest in liver data: 0.2")
+    outliers: float = choice(0.4, "", "largest share of points that may fit nowhere", "robustness: outliers")
+    foreign: float = choice(0.2, "", "share of them from which on they may not form a surface", "foreign_patches")
+    load: float = choice(1.2, "times the largest that was learned", "largest load of a network", "learning_limits")
+    discrepancy: float = choice(
+        1.5, "times what was seen", "most of what the model gets wrong", "verdict: patch of 30 % by 10 mm"
+    )
+    informed: float = choice(
+        0.5, "", "part of a direction's variance that a cloud has to take away, where all forces are known", "inclusion"
+    )
+    harmless: float = choice(5e-4, "sizes of the body", "correction by that error which harms nobody", "verdict")
+    normals: float = choice(
+        3.0, "times what was expected", "largest median lean of measured normals", "normals of turned frames"
+    )
+    fewest_points: float = choice(30, "points", "fewest of a cloud", "verdict: few points")
+    fewest_directions: float = choice(2.0, "directions", "fewest of force that a cloud tells", "verdict: few points")
+    line: float = choice(0.02, "of its length", "width of a cloud that is taken for a line", "geometry")
+    thin: float = choice(0.05, "of the spread", "thickness of points that form a surface: 0.1 of a space", "outliers")
+    linear: float = choice(
+        0.03, "radians, strain", "largest turn or stretch of a linear law: half of it is off by", "linear_response"
+    )
+    refused: float = choice(1.5, "times the level", "from there on a result is of no use", "verdict: another organ")
+    lost: float = choice(
+        1.5,
+        "times the distances of the last frame",
+        "from there on a cloud is searched for from rest",
+        "liver sequences: frames of changed places of force",
+    )
+    elsewhere: float = choice(
+        0.5,
+        "of the distances left",
+        "less of them left with forces elsewhere, or with one contact not: forces act otherwise than was said",
+        "contact, robustness: no zone",
+    )
 
 
-POLICY = Policy()
+@dataclass(frozen=True)
+class Accuracy:
+    """How closely, or how much of it: numbers that change time and not answers."""
+
+    settled: float = choice(
+        0.2, "posterior deviations a coefficient", "a shorter step is the last", "with 0.3 errors are 4 % larger"
+    )
+    enough: float = choice(
+        0.3, "posterior deviations a coefficient", "the same where no step lowers the objective further"
+    )
+    handed_on: float = choice(
+        1.0, "posterior deviations a coefficient", "a shorter step ends the search with a first loss"
+    )
+    graduation: float = choice(
+        1.0, "of what a step promises to change", "least noise that is believed far from the minimum"
+    )
+    first_step: float = choice(0.05, "sizes of the body", "first limit on the movement of a node in one step")
+    iterations: int = count(40, "", "most iterations of Gauss-Newton")
+    rough_iterations: int = count(15, "", "most iterations for a start")
+    unshared_iterations: int = count(8, "", "iterations before noise that neighbours share is thought of")
+    kept: float = choice(0.2, "of what a step promised", "derivatives are kept after a step that missed it by less")
+    trusted: float = choice(
+        3.0, "deviations", "points nearer to the surface are not searched anew before the end of a tracked frame"
+    )
+    closer: float = choice(1e-3, "of the objective", "closest points searched anew have to take away to go on")
+    unchanged: float = choice(0.3, "times the noise", "a smaller change of a distance is not looked at")
+    summed: float = choice(0.02, "of all weights", "points are summed anew where weights have changed by more")
+    groups: int = count(6, "", "groups of points by how far the model's error makes them doubtful")
+    lengths: int = count(5, "", "lengths of shared noise that are looked at")
+    sizes: int = count(40, "", "sizes of it")
+    surface_modes: int = count(48, "", "modes of the observed side for each component of it")
+    first_modes: int = count(20, "", "of these are asked first")
+    hoped: float = choice(0.25, "of what is believed against it", "these have to promise to go on")
+    carried: float = choice(0.9, "of its variance", "what modes carry of a model's error beside its patterns")
+    points: int = count(1000, "", "larger clouds are thinned to so many points")
+    few_points: int = count(300, "", "of these look for the place of the forces")
+    rounds: int = count(2, "", "rounds of gathering forces")
+    leading: int = count(6, "", "directions of force that a cold start begins with")
+    anchors: int = count(3, "", "exact states from which a fast model goes on")
+    far: float = choice(
+        3.0, "times its noise", "so far from the last frame, a cloud may lie nearer to the body at rest"
+    )
+    glance: int = count(100, "", "points that this is seen from")
+    searching: float = choice(0.7, "of the time left for a frame", "that a search from rest may take")
+    watched: int = count(300, "", "nodes whose movement limits a step")
+    drawn: int = count(64, "", "combinations that stand for directions of force that were left out")
+    neighbours: int = count(6, "", "of a point, of which it is seen what they share")
+    asked: int = count(250, "", "points whose neighbours are looked at")
+
+
+POLICY, ACCURACY = Policy(), Accuracy()
+
+
+@contextmanager
+def varied(name: str, factor: float) -> Iterator[None]:
+    """A number times a factor, for who looks at what it does; registrars are to be made within.
+
+    Args:
+        name: of it, in either table.
+        factor: that it is multiplied with; of a chance its logarithm is, of a whole number the result is rounded.
+    """
+    table = POLICY if name in {each.name for each in fields(POLICY)} else ACCURACY
+    before = getattr(table, name)
+    changed = type(before)(max(1, round(before * factor))) if isinstance(before, int) else before * factor
+    object.__setattr__(table, name, changed)
+    try:
+        yield
+    finally:
+        object.__setattr__(table, name, before)

@@ -21,14 +21,13 @@ from .parameters.discrepancy import ModelError
 from .parameters.inputs import InputBlocks
 from .parameters.nodal_forces import NodalForces
 from .parameters.pose import PosePrior
-from .policy import POLICY
+from .policy import ACCURACY, POLICY
 from .posterior import Posterior
 from .residuals.term import ResidualTerm
 from .surface_distance import Correspondence, SurfaceDistance, expected_distance
 from .verdict import Check
 
 Floats = NDArray[np.float64]
-_WATCHED = 300  # nodes whose movement limits a step
 _Kind = TypeVar("_Kind", bound=ParameterBlock)
 
 
@@ -364,7 +363,7 @@ class Problem:
 
     def moved(self, evaluation: Evaluation, change: Floats) -> Floats:
         """How far some hundred nodes, spread over those observed, move for a change, first order, (m,), metres."""
-        every = max(1, len(self.observed.nodes) // _WATCHED)
+        every = max(1, len(self.observed.nodes) // ACCURACY.watched)
         shifts = [block.moved(evaluation, change[part], every) for block, part in self.parts]
         shifted = np.asarray(sum(shift for shift in shifts if shift is not None))
         return np.sqrt(np.einsum("pi,pi->p", shifted, shifted))

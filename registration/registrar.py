@@ -25,7 +25,7 @@ from .parameters.block import ParameterBlock
 from .parameters.inputs import InputBlocks
 from .parameters.nodal_forces import LikelihoodInformed, NodalForces, known_forces, nodal_forces
 from .parameters.pose import PosePrior
-from .policy import POLICY
+from .policy import ACCURACY, POLICY
 from .prepared import Prepared
 from .residuals.term import ResidualTerm
 from .result import Registration, badness
@@ -38,8 +38,6 @@ from .tracker import Tracker
 from .verdict import Check, Code, Verdict
 
 Floats = NDArray[np.float64]
-_SEARCHING = 0.7  # of the time that is left for a frame: the search from rest, whose end takes the others
-_MISSED, _EXPLAINED = 1.0, 0.5  # times the least noise, shared by neighbours; part of it that forces anywhere leave
 
 
 class Registrar:
@@ -251,7 +249,7 @@ class Registrar:
         result = self._concluded(track(setup, points, start), begin)
         if has_left(setup, result, start) and not setup.is_late:
             now = time.monotonic()
-            hurried = self.limited(now + _SEARCHING * (setup.options.solver.until - now))
+            hurried = self.limited(now + ACCURACY.searching * (setup.options.solver.until - now))
             other = hurried._cold(points, begin, result)
             best = other if other is result else min(other, result, key=badness)
             return replace(best, seconds=time.perf_counter() - begin)
@@ -278,7 +276,7 @@ class Registrar:
             return found
         match = found.evaluation.match  # with those points that were taken for outliers: patches of them are none
         inflation_factor = shared(setup.observed.closest_points(match), match.distances, np.ones(len(match.distances)))
-        is_missed = match.rms * np.sqrt(inflation_factor) > _MISSED * setup.noise.minimum
+        is_missed = match.rms * np.sqrt(inflation_factor) > setup.noise.minimum
         if not is_missed or setup.is_late:
             return found
         try:
@@ -374,7 +372,7 @@ def prepare(
 def _elsewhere(within: float, anywhere: float) -> Check:
     """Whether forces outside the zone explain a cloud better: root mean square distances with both, metres."""
     ratio = anywhere / within
-    is_better = ratio < _EXPLAINED
+    is_better = ratio < POLICY.elsewhere
     reason = (
         f"forces outside the zone explain the cloud better: points lie {1e3 * within:.2f} mm from the surface, with "
         f"forces anywhere {1e3 * anywhere:.2f} mm"
@@ -382,7 +380,13 @@ def _elsewhere(within: float, anywhere: float) -> Check:
     verdict = Verdict.DOUBTFUL if is_better else Verdict.ACCEPTED
     unit = "of the distances that are left"
     return Check(
-        Code.FORCES_ELSEWHERE, verdict, ratio, _EXPLAINED, unit, is_minimum=True, reason=reason if is_better else ""
+        Code.FORCES_ELSEWHERE,
+        verdict,
+        ratio,
+        POLICY.elsewhere,
+        unit,
+        is_minimum=True,
+        reason=reason if is_better else "",
     )
 
 

@@ -13,9 +13,9 @@ from .evaluation import Evaluation
 from .forward import State
 from .gauss_newton import IterationRecord, SolverResult
 from .local_model import LocalModel
-from .options import NOISE
 from .outcome import Outcome
 from .parameters.block import Estimate
+from .policy import POLICY
 from .pose import Pose
 from .posterior import Posterior
 from .prepared import Prepared
@@ -216,7 +216,7 @@ class Registration:
     def shared_noise(self) -> tuple[float, float] | None:
         """Size and length of the noise that neighbours share, metres; None where it is less than any camera's."""
         scales = self.posterior.scales
-        if self.problem.shared is None or scales.shared < NOISE.minimum:
+        if self.problem.shared is None or scales.shared < POLICY.noise_minimum:
             return None
         return scales.shared, scales.length
 

@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from .hyperparameters import LENGTH, SHARED
+from .policy import ACCURACY
 
 if TYPE_CHECKING:
     from .local_model import LocalModel
     from .problem import Problem
 
 Floats = NDArray[np.float64]
-_LENGTHS, _SIZES = 5, 40  # of noise that neighbours share, from the least to the largest
-_FIRST = 20  # of its modes are asked first
-_HOPED = 0.25  # of what is believed against it that these have to promise
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +90,8 @@ def gain_by_shared_noise(local: LocalModel, problem: Problem) -> tuple[float, fl
     best = (-np.inf, 0.0, 0.0)
     if problem.shared is None:
         return best
-    few = _SharedNoise(local, problem.with_shared(problem.shared.leading(_FIRST)))
-    if all(few.promised(length) < _HOPED for length in few.lengths):
+    few = _SharedNoise(local, problem.with_shared(problem.shared.leading(ACCURACY.first_modes)))
+    if all(few.promised(length) < ACCURACY.hoped for length in few.lengths):
         return best
     every = _SharedNoise(local, problem)
     return max([best, *(every.best(length) for length in every.lengths if every.promised(length) >= 1.0)])
@@ -115,10 +113,10 @@ class _SharedNoise:
         shrunk = float(np.sum((weights * scaled) ** 2) / max(weights.sum(), 1e-300))
         self._pull = pull / np.sqrt(max(shrunk, 1e-300))
         median, high = float(hyperprior.median[SHARED]), float(hyperprior.highest[SHARED])
-        self._sizes = np.linspace(max(float(hyperprior.lowest[SHARED]), median), high, _SIZES)
+        self._sizes = np.linspace(max(float(hyperprior.lowest[SHARED]), median), high, ACCURACY.sizes)
         self._costs = 0.5 * ((self._sizes - median) / hyperprior.spread[SHARED]) ** 2
         self.lengths: list[float] = np.linspace(
-            hyperprior.lowest[LENGTH], hyperprior.highest[LENGTH], _LENGTHS
+            hyperprior.lowest[LENGTH], hyperprior.highest[LENGTH], ACCURACY.lengths
         ).tolist()
 
     def _scaled(self, length: float) -> tuple[Floats, Floats]:

@@ -24,6 +24,7 @@ from .parameters.discrepancy import ModelError
 from .parameters.inputs import InputBlocks
 from .parameters.nodal_forces import NodalForces
 from .parameters.pose import PosePrior
+from .policy import POLICY
 from .prepared import Prepared
 from .problem import Problem
 from .residuals.normals import Normals
@@ -31,7 +32,6 @@ from .residuals.term import ResidualTerm
 from .surface_distance import SurfaceDistance
 
 Floats = NDArray[np.float64]
-_HOPELESS = 1.25  # times the largest noise expected: no more time is spent
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,4 +185,4 @@ class Setup:
         """Whether what was found is so far off that it is no state of this organ."""
         if found.outcome is Outcome.OUT_OF_TIME:  # who knows
             return False
-        return found.local.noise > _HOPELESS * self.expectations.noise
+        return found.local.noise > POLICY.refused * self.expectations.noise

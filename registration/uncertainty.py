@@ -20,12 +20,12 @@ from softtwin.meshes.embedding import Embedding
 from .evaluation import Evaluation
 from .forward import ReducedModel
 from .parameters.nodal_forces import NodalForces
+from .policy import ACCURACY
 from .posterior import Posterior
 from .problem import Problem
 
 Floats = NDArray[np.float64]
 CoordinateFrame = Literal["body", "camera"]  # what is attached to the organ's support lies still, or what the camera is
-_DRAWN = 64  # combinations that stand for all directions that were left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +122,9 @@ def unseen_response(model: ReducedModel, forces: NodalForces) -> Floats:
     directions = forces.unseen
     if directions is None:
         return np.zeros((3 * forces.count, 0))
-    if directions.shape[1] > _DRAWN:
-        chance = np.random.default_rng(0).standard_normal((directions.shape[1], _DRAWN))
-        directions = directions @ (chance / np.sqrt(_DRAWN))
+    if directions.shape[1] > ACCURACY.drawn:
+        chance = np.random.default_rng(0).standard_normal((directions.shape[1], ACCURACY.drawn))
+        directions = directions @ (chance / np.sqrt(ACCURACY.drawn))
     return np.asarray(model.solve(np.zeros(model.count)).full.jvp(directions))
 
 

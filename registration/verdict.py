@@ -7,7 +7,7 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 
 class Verdict(Enum):
@@ -174,3 +174,13 @@ def largest_normal(value: float, count: int) -> tuple[str, float]:
 def of_several(chance: float, count: int) -> float:
     """The chance that the largest of so many is as far out, where one is with a chance."""
     return 1.0 if chance >= 1.0 else float(-np.expm1(count * np.log1p(-chance)))
+
+
+def one_of_several(chance: float, count: int) -> float:
+    """The chance of one, where the largest of so many is as far out with a chance: the inverse of `of_several`."""
+    return float(-np.expm1(np.log1p(-chance) / count))
+
+
+def normal_level(chance: float, count: int = 1) -> float:
+    """Deviations beyond which the largest of several standard normal numbers, of either sign, lies with a chance."""
+    return float(-ndtri(0.5 * one_of_several(chance, count)))

@@ -18,7 +18,7 @@ from ..evaluation import Evaluation, Slopes
 from ..expectations import Expectations
 from ..hyperparameters import Hyperparameters, LogNormalPrior
 from ..surface_distance import SurfaceDistance
-from ..verdict import Check, Code, checked, largest_normal
+from ..verdict import Check, Code, checked, largest_normal, normal_level
 
 Floats = NDArray[np.float64]
 WITHIN_90 = 1.6449  # deviations of a normal law that hold 90 %
@@ -179,7 +179,7 @@ class ParameterBlock:
             yield checked(
                 Code.PARAMETER,
                 known.deviations,
-                expected.parameter,
+                normal_level(expected.unlikely),
                 far,
                 unit="deviations",
                 law=largest_normal(known.deviations, 1),

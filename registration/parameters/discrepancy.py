@@ -16,14 +16,14 @@ from ..evaluation import Evaluation, Slopes
 from ..expectations import Expectations
 from ..forward import Discrepancy
 from ..hyperparameters import DISCREPANCY, LogNormalPrior
-from ..policy import POLICY
+from ..policy import ACCURACY, POLICY
 from ..surface_distance import SurfaceDistance
 from ..surface_modes import SurfaceModes
 from ..verdict import Check, Code, checked
 from .block import BlockPosterior, FieldBlock, ParameterBlock
 
 Floats = NDArray[np.float64]
-_SMOOTHNESS, _CARRIED = 1.5, 0.9  # of what the patterns leave out, and part of its variance
+_SMOOTHNESS = 1.5  # of what the patterns leave out, as of all fields: once differentiable
 
 
 class ModelError(FieldBlock):
@@ -146,5 +146,5 @@ def _modes_of_rest(discrepancy: Discrepancy, observed: SurfaceDistance) -> tuple
     base = 4.0 * np.pi * nu**2 * discrepancy.places / ((2.0 * nu + 1.0) * area)
     logs, _ = modes.spread(np.sqrt(2.0 * nu / base), nu)
     carried = np.cumsum(np.exp(logs))
-    kept = min(len(logs), 1 + int(np.searchsorted(carried, _CARRIED)))
+    kept = min(len(logs), 1 + int(np.searchsorted(carried, ACCURACY.carried)))
     return modes.leading(kept), logs[:kept]

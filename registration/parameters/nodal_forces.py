@@ -248,7 +248,7 @@ def _parted_net(parts: Floats, patterns: Floats) -> Floats:
 
 
 def contact(
-    forces: NodalForces, nodal: Floats, positions: Floats, reach: float, minimum: float = POLICY.force_elsewhere
+    forces: NodalForces, nodal: Floats, positions: Floats, reach: float, minimum: float | None = None
 ) -> Floats:
     """Where forces were found, as parts of the largest, (n,): the next prior of forces whose place is unknown.
 
@@ -259,14 +259,15 @@ def contact(
         nodal: forces found, (n, 3), newtons.
         positions: of the nodes at rest, (n, 3), metres.
         reach: forces within this distance count together, metres.
-        minimum: no part is smaller: a force elsewhere stays possible.
+        minimum: no part is smaller: a force elsewhere stays possible; that of the policy if not given.
     """
+    least = POLICY.force_elsewhere if minimum is None else minimum
     place = positions[forces.nodes]
     size = np.linalg.norm(nodal[forces.nodes], axis=1)
     near = cKDTree(place).sparse_distance_matrix(cKDTree(place), 3.0 * reach, output_type="coo_matrix")
     smooth = coo_array((np.exp(-0.5 * (near.data / reach) ** 2), (near.row, near.col)), shape=near.shape) @ size
     where = np.zeros(len(positions))
-    where[forces.nodes] = np.maximum(smooth / max(smooth.max(), 1e-300), minimum)
+    where[forces.nodes] = np.maximum(smooth / max(smooth.max(), 1e-300), least)
     return where
 
 

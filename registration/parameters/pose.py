@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..evaluation import Evaluation, Slopes
 from ..expectations import Expectations
 from ..pose import Pose
-from ..verdict import Check, Code, checked, largest_normal
+from ..verdict import Check, Code, checked, largest_normal, normal_level
 from .block import BlockPosterior, ParameterBlock
 
 Floats = NDArray[np.float64]
@@ -93,4 +93,5 @@ class PosePrior(ParameterBlock):
         advice = "say --pose unknown" if self.is_said else "give a better start"
         far = f"the pose lies {largest:.1f} deviations from where it was expected; {advice}"
         law = largest_normal(largest, len(values))
-        yield checked(Code.POSE, largest, expected.pose, far, unit="deviations", law=law)
+        level = normal_level(expected.unlikely, len(values))
+        yield checked(Code.POSE, largest, level, far, unit="deviations", law=law)

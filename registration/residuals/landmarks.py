@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
 from ..evaluation import Evaluation, Slopes
 from ..loss import Huber, Loss
+from ..policy import POLICY
 from ..surface_distance import Correspondence, SurfaceDistance
-from ..verdict import Check, Code, checked, of_several
+from ..verdict import Check, Code, checked, of_several, one_of_several
 from .term import ResidualTerm
 
 Floats = NDArray[np.float64]
 _LOSS = Huber()  # a landmark may have been taken for another
-_MARK_OFF = 4.0  # deviations of a landmark's place; three axes together are beyond it once in a thousand
 _REACH = 0.05  # of the body's size: further off the observed side a point is none of it
 
 
@@ -96,5 +96,5 @@ class LandmarkPairs(ResidualTerm):
             f"largest of {len(off)} lengths of three normal deviations",
             of_several(float(chdtrc(3, largest**2)), len(off)),
         )
-        subject = f"landmark {number}"
-        yield checked(Code.LANDMARKS, largest, _MARK_OFF, away, unit="deviations", law=law, subject=subject)
+        subject, level = f"landmark {number}", float(np.sqrt(chdtri(3, one_of_several(POLICY.unlikely, len(off)))))
+        yield checked(Code.LANDMARKS, largest, level, away, unit="deviations", law=law, subject=subject)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation import Evaluation, Slopes
+from ..policy import POLICY
 from ..surface_distance import Correspondence
 from ..verdict import Check, Code, checked
 from .term import ResidualTerm
@@ -15,7 +16,6 @@ from .term import ResidualTerm
 Floats = NDArray[np.float64]
 # Radians, of a measured normal across itself: cameras' are off by some 10 degrees, and flat triangles by some more.
 NORMAL_DEVIATION = float(np.deg2rad(10.0))
-_LEANING = 3.0  # times what normals of the deviation that was told would be off by in the median
 
 
 class Normals(ResidualTerm):
@@ -58,4 +58,4 @@ class Normals(ResidualTerm):
             f"the cloud's normals do not match: half of them lean by more than {median:.0f} degrees from the surface "
             f"found, where {expected:.0f} were expected"
         )
-        yield checked(Code.NORMALS, median, _LEANING * expected, lean, unit="degrees")
+        yield checked(Code.NORMALS, median, POLICY.normals * expected, lean, unit="degrees")

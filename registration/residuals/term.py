@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
 from ..evaluation import Evaluation, Slopes
-from ..expectations import UNLIKELY
 from ..loss import Loss
+from ..policy import POLICY
 from ..surface_distance import Correspondence
 from ..verdict import Check, Code, checked
 
@@ -60,4 +60,6 @@ class ResidualTerm:
         law = f"chi-square, {count} degrees of freedom", float(chdtrc(count, square))
         rms = np.sqrt(square / count)
         off = f"{self.name}: residuals are {rms:.1f} times their standard deviation"
-        yield checked(Code.RESIDUAL_TERM, square, float(chdtri(count, UNLIKELY)), off, law=law, subject=self.name)
+        yield checked(
+            Code.RESIDUAL_TERM, square, float(chdtri(count, POLICY.unlikely_score)), off, law=law, subject=self.name
+        )

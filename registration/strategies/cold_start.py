@@ -11,12 +11,12 @@ from ..cloud import Cloud
 from ..gauss_newton import GaussNewton, SolverResult
 from ..lbfgs import LBFGS
 from ..parameters.nodal_forces import contact, localised
+from ..policy import ACCURACY
 from ..prepared import Prepared
 from ..problem import Problem
 from ..setup import Ended, Setup, after
 
 Floats = NDArray[np.float64]
-_LEADING = 6  # directions of force that a cold start begins with
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def from_rest(setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewt
         prepared: forces.
         solver: that ends it.
     """
-    few, first = points.thinned(setup.options.localisation.points), prepared.leading(_LEADING)
+    few, first = points.thinned(setup.options.localisation.points), prepared.leading(ACCURACY.leading)
     rough, problem = setup.plain(few, first).unshared, setup.plain(points, prepared)
     begun = solver.rough().solve(rough, np.zeros(rough.size))
     start = problem.carried(begun.evaluation.coefficients, rough)

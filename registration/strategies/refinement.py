@@ -16,13 +16,13 @@ from ..forward import ForwardModel
 from ..gauss_newton import GaussNewton, SolverResult
 from ..lbfgs import LBFGS
 from ..manifold_mapping import ManifoldMapping
+from ..policy import ACCURACY
 from ..problem import Problem
 from ..result import Registration
 from ..setup import Ended, Setup, after
 from .cold_start import Localised, finish
 
 Floats = NDArray[np.float64]
-_ANCHORS = 3  # exact states from which a fast model goes on
 
 
 def refine(
@@ -68,7 +68,7 @@ def _approached(
     it is of L-BFGS, which wants the whole body's slopes.
     """
     spent: list[SolverResult] = []
-    for _ in range(_ANCHORS):
+    for _ in range(ACCURACY.anchors):
         if problem.inputs is not None or not isinstance(solver, GaussNewton):
             break
         place = near.coefficients[problem.force_part]

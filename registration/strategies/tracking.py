@@ -7,13 +7,10 @@ import numpy as np
 from ..cloud import Cloud
 from ..evaluation import Evaluation
 from ..loss import robust_deviation
+from ..policy import ACCURACY, POLICY
 from ..result import Registration
 from ..setup import Ended, Setup
 from .cold_start import Localised, finish, from_rest
-
-_FAR = 3.0  # times its noise: as far from the last frame's surface, a cloud may lie nearer to the body at rest
-_GLANCE = 100  # points that this is seen from
-_LEFT = 1.5  # times the noise of the frame before
 
 
 def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
@@ -35,14 +32,14 @@ def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
 
 def has_left(setup: Setup, found: Registration, last: Registration) -> bool:
     """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
-    return found.scatter > _LEFT * max(last.scatter, setup.noise.minimum)
+    return found.scatter > POLICY.lost * max(last.scatter, setup.noise.minimum)
 
 
 def _is_nearer_at_rest(setup: Setup, near: Evaluation, last: Registration) -> bool:
     """True where a cloud lies nearer to the body at rest than to what the last frame has found."""
     far = robust_deviation(near.match.distances)
-    if far < _FAR * max(last.noise, setup.options.noise.minimum):
+    if far < ACCURACY.far * max(last.noise, setup.options.noise.minimum):
         return False
-    few = near.cloud[:: max(1, len(near.cloud) // _GLANCE)]
+    few = near.cloud[:: max(1, len(near.cloud) // ACCURACY.glance)]
     rest = setup.observed.match(np.zeros_like(near.positions), few)
     return robust_deviation(rest.distances) < far
