@@ -69,8 +69,8 @@ def _convergence(found: SolverResult) -> Check:
 def _cloud(problem: Problem, found: SolverResult, expected: Expectations) -> Iterator[Check]:
     cloud = problem.cloud
     spread = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False) / np.sqrt(len(cloud))
-    few = f"the cloud has {len(cloud)} points; fewer than {POLICY.fewest_points} tell little"
-    yield checked(Code.POINT_COUNT, len(cloud), POLICY.fewest_points, few, is_minimum=True)
+    few = f"the cloud has {len(cloud)} points; fewer than {POLICY.minimum_points} tell little"
+    yield checked(Code.POINT_COUNT, len(cloud), POLICY.minimum_points, few, is_minimum=True)
     width = float(spread[1] / spread[0]) if len(cloud) >= 3 and spread[0] > 0.0 else 0.0
     narrow = "the cloud is a line or a spot: it shows no surface"
     yield checked(Code.CLOUD_SHAPE, width, POLICY.line, narrow, is_minimum=True, refused=POLICY.line)

@@ -35,7 +35,7 @@ class Expectations:
     movement: float
     outliers: float = field(default_factory=lambda: POLICY.outliers)
     extrapolation_ratio: float = field(default_factory=lambda: POLICY.load)
-    informed: float = field(default_factory=lambda: POLICY.fewest_directions)
+    informed: float = field(default_factory=lambda: POLICY.minimum_directions)
     unlikely: float = field(default_factory=lambda: POLICY.unlikely)
     discrepancy_scale: float = field(default_factory=lambda: POLICY.discrepancy)
     correction: float = 0.0

@@ -22,7 +22,7 @@ _MANY = 10_000  # points: of no cloud that is left after thinning are there more
 NOISE_MEDIAN = 5e-4  # metres: of clouds of which nobody says anything
 
 
-def usual_noise(median: float = NOISE_MEDIAN) -> LogNormalPrior:
+def noise_prior(median: float = NOISE_MEDIAN) -> LogNormalPrior:
     """What is believed of the standard deviation of a point's distance, metres.
 
     Args:
@@ -31,7 +31,7 @@ def usual_noise(median: float = NOISE_MEDIAN) -> LogNormalPrior:
     return LogNormalPrior(median, POLICY.noise_spread, minimum=POLICY.noise_minimum)
 
 
-NOISE = usual_noise()
+NOISE = noise_prior()
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class ForceHyperprior:
 
     clear: float = 0.0
     loud: float = np.inf
-    spread: float = field(default_factory=lambda: POLICY.force_spread_told)
+    spread: float = field(default_factory=lambda: POLICY.force_spread_free)
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class RegistrationOptions:
         correlated: reckon with noise that neighbouring points share; see `surface_modes`.
     """
 
-    noise: LogNormalPrior = field(default_factory=usual_noise)
+    noise: LogNormalPrior = field(default_factory=noise_prior)
     solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
     maximum_points: int = field(default_factory=lambda: ACCURACY.points)
     localisation: SparseLocalisation = field(default_factory=SparseLocalisation)
@@ -118,7 +118,7 @@ def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> 
         has_zone: the nodes that may carry force are those that a tool can touch.
         has_pose: the pose is unknown.
     """
-    clear, loud = POLICY.force_told_below * POLICY.noise_minimum, POLICY.force_told_above * model.error
+    clear, loud = POLICY.force_scale_free_below * POLICY.noise_minimum, POLICY.force_scale_free_above * model.error
     if model.error == 0.0:
         localisation = SparseLocalisation(rounds=0 if has_zone else ACCURACY.rounds, points=_MANY)
         return RegistrationOptions(localisation=localisation, hyperprior=ForceHyperprior(clear))

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 
+_CHANCE = "chance"  # unit of one
+
 
 def choice(value: float, unit: str, meaning: str, source: str = "") -> float:
     """A number with what a reader wants to know of it.
@@ -115,10 +117,10 @@ class Policy:
         "standard deviation of the logarithm of a nodal force's size: with more, forces explain noise",
         "robustness, surrogate: noise 5 mm (0.35, 0.5, 1.0: 0.52, 0.54, 0.64 mm)",
     )
-    force_spread_told: float = choice(
+    force_spread_free: float = choice(
         1.0,
         "",
-        "the same where the cloud can tell it: see `force_told_below`, `force_told_above`",
+        "the same where the cloud can tell it: see `force_scale_free_below`, `force_scale_free_above`",
         "robustness, reference: clean; a sharp pull of an unexpected size would be called outliers",
     )
     force_spread_anywhere: float = choice(
@@ -127,10 +129,10 @@ class Policy:
         "the same of a model that errs, where no zone is told: forces gathered at a small place are larger",
         "misspecified, surrogate: as it is; smaller values make it worse",
     )
-    force_told_below: float = choice(
+    force_scale_free_below: float = choice(
         2.0, "times the least noise", "a clearer cloud tells the size of the forces", "robustness, reference: clean"
     )
-    force_told_above: float = choice(
+    force_scale_free_above: float = choice(
         1.5,
         "times the model's error",
         "so does one of more noise, beside which that error is small",
@@ -155,13 +157,13 @@ class Policy:
     # From where on a result is doubtful; refused, where that is possible, beyond `refused` times the level.
     unlikely: float = choice(
         2.7e-3,
-        "",
+        _CHANCE,
         "chance of what lies too far from where it was expected: three standard deviations of one number",
         "verdict, right clouds",
     )
     unlikely_score: float = choice(
         1e-5,
-        "",
+        _CHANCE,
         "the same of score tests: forces that are localised by the cloud that they explain leave larger ones than "
         "chi-square has",
         "verdict, right clouds",
@@ -186,8 +188,8 @@ class Policy:
     normals: float = choice(
         3.0, "times what was expected", "largest median lean of measured normals", "normals of turned frames"
     )
-    fewest_points: float = choice(30, "points", "fewest of a cloud", "verdict: few points")
-    fewest_directions: float = choice(2.0, "directions", "fewest of force that a cloud tells", "verdict: few points")
+    minimum_points: float = choice(30, "points", "fewest of a cloud", "verdict: few points")
+    minimum_directions: float = choice(2.0, "directions", "fewest of force that a cloud tells", "verdict: few points")
     line: float = choice(0.02, "of its length", "width of a cloud that is taken for a line", "geometry")
     thin: float = choice(0.05, "of the spread", "thickness of points that form a surface: 0.1 of a space", "outliers")
     linear: float = choice(
@@ -246,7 +248,7 @@ class Accuracy:
     few_points: int = count(300, "", "of these look for the place of the forces")
     rounds: int = count(2, "", "rounds of gathering forces")
     leading: int = count(6, "", "directions of force that a cold start begins with")
-    anchors: int = count(3, "", "exact states from which a fast model goes on")
+    expansion_points: int = count(3, "", "exact states from which a fast model goes on")
     far: float = choice(
         3.0, "times its noise", "so far from the last frame, a cloud may lie nearer to the body at rest"
     )
@@ -272,6 +274,8 @@ def varied(name: str, factor: float) -> Iterator[None]:
     table = POLICY if name in {each.name for each in fields(POLICY)} else ACCURACY
     before = getattr(table, name)
     changed = type(before)(max(1, round(before * factor))) if isinstance(before, int) else before * factor
+    if next(each.metadata["unit"] for each in fields(table) if each.name == name) == _CHANCE:
+        changed = before**factor
     object.__setattr__(table, name, changed)
     try:
         yield

@@ -344,14 +344,14 @@ class Problem:
         """
         slopes = self.slopes(evaluation) if slopes is None else slopes
         return np.hstack(
-            [block.columns(evaluation, evaluation.coefficients[part], slopes) for block, part in self.parts]
+            [block.jacobian(evaluation, evaluation.coefficients[part], slopes) for block, part in self.parts]
         )
 
     def vjp(self, evaluation: Evaluation, cotangent: Floats, slopes: Slopes | None = None) -> Floats:
         """Gradient by the coefficients, (k,), from the one by the residuals, (q,): J^T g with the adjoint."""
         slopes = self.slopes(evaluation) if slopes is None else slopes
         return np.concatenate(
-            [block.pulled(evaluation, evaluation.coefficients[part], slopes, cotangent) for block, part in self.parts]
+            [block.vjp(evaluation, evaluation.coefficients[part], slopes, cotangent) for block, part in self.parts]
         )
 
     def normals(self, evaluation: Evaluation) -> Floats:

@@ -159,7 +159,7 @@ def uncertainty(
     if frame == "camera" and problem.pose is not None and evaluation.pose is not None:
         places = problem.observed.body.points + evaluation.state.full.displacement + problem.correction(evaluation)
         slopes, unseen = _turned(evaluation.pose.rotation, slopes), _turned(evaluation.pose.rotation, unseen)
-        by_pose = problem.pose.jacobian(evaluation.coefficients[problem.pose_part], places)
+        by_pose = problem.pose.seen_jacobian(evaluation.coefficients[problem.pose_part], places)
         slopes[:, problem.pose_part] = by_pose.reshape(-1, by_pose.shape[2])
     else:
         moving[problem.pose_part] = False

@@ -120,7 +120,7 @@ class ParameterBlock:
         """
         return 0.0, {}
 
-    def columns(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
         """Derivative of residuals by the coefficients, (q, c).
 
         Args:
@@ -130,9 +130,9 @@ class ParameterBlock:
         """
         raise NotImplementedError
 
-    def pulled(self, at: Evaluation, own: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
+    def vjp(self, at: Evaluation, own: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
         """The same, transposed and applied to a gradient by the residuals, (q,): (c,)."""
-        return cotangent @ self.columns(at, own, slopes)
+        return cotangent @ self.jacobian(at, own, slopes)
 
     def added(self, own: Floats) -> Floats | None:
         """What it adds to the displacement of the observed nodes, (m, 3), metres; None for nothing."""
@@ -211,12 +211,12 @@ class FieldBlock(ParameterBlock):
         """Number of fields."""
         return int(self.modes.shape[1])
 
-    def columns(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
-        """See `ParameterBlock.columns`."""
+    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+        """See `ParameterBlock.jacobian`."""
         return self.amplitude * np.asarray(slopes.rows @ self.observed_modes)
 
-    def pulled(self, at: Evaluation, own: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
-        """See `ParameterBlock.pulled`."""
+    def vjp(self, at: Evaluation, own: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
+        """See `ParameterBlock.vjp`."""
         found: Floats = self.amplitude * ((slopes.rows.T @ cotangent) @ self.observed_modes)
         return found
 

@@ -56,8 +56,8 @@ class CorrelatedNoise(ParameterBlock):
         spread, by_length = self.modes.spread(float(np.exp(eta[LENGTH])))
         return 2.0 * eta[SHARED] + np.tile(spread, 3), {SHARED: 2.0, LENGTH: np.tile(by_length, 3)}
 
-    def columns(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
-        """See `ParameterBlock.columns`."""
+    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+        """See `ParameterBlock.jacobian`."""
         return self.by_points(at) if slopes.match is not None else np.zeros((slopes.rows.shape[0], self.size))
 
     def by_points(self, at: Evaluation) -> Floats:

@@ -120,8 +120,8 @@ class RestOfModelError(ParameterBlock):
         """
         return at.once((self, "rough"), lambda: at.observed.at_points(at.match, self.deviation))
 
-    def columns(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
-        """See `ParameterBlock.columns`."""
+    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+        """See `ParameterBlock.jacobian`."""
         match = slopes.match
         if match is None:
             return np.zeros((slopes.rows.shape[0], self.size))

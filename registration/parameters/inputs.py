@@ -187,8 +187,8 @@ class InputBlocks(ParameterBlock):
             begin = own.stop
         return tuple(found)
 
-    def columns(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
-        """See `ParameterBlock.columns`."""
+    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+        """See `ParameterBlock.jacobian`."""
         return cast(ParametrisedState, at.state).rows_by_parameters(slopes.rows)
 
     def moved(self, at: Evaluation, change: Floats, every: int) -> Floats:

@@ -64,12 +64,12 @@ class NodalForces(ParameterBlock):
         """See `ParameterBlock.log_variances`."""
         return 2.0 * float(eta[SCALE]), {SCALE: 2.0}
 
-    def columns(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
-        """See `ParameterBlock.columns`."""
+    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+        """See `ParameterBlock.jacobian`."""
         return at.state.jacobian(slopes.rows)
 
-    def pulled(self, at: Evaluation, own: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
-        """See `ParameterBlock.pulled`: by the adjoint state."""
+    def vjp(self, at: Evaluation, own: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
+        """See `ParameterBlock.vjp`: by the adjoint state."""
         full = np.zeros_like(at.observed.body.points)
         full[at.observed.nodes] = (slopes.rows.T @ cotangent).reshape(-1, 3)
         found: Floats = at.stiffness_scaling * (at.state.full.vjp(full).ravel() @ self.basis)

@@ -54,7 +54,7 @@ class PosePrior(ParameterBlock):
         """The pose for coefficients of unit variance, (6,)."""
         return self.mean.moved(self.deviations * coefficients, self._pivot)
 
-    def jacobian(self, coefficients: Floats, points: Floats) -> Floats:
+    def seen_jacobian(self, coefficients: Floats, points: Floats) -> Floats:
         """Derivative of where the camera sees points by the coefficients, (p, 3, 6), metres, on the camera's axes.
 
         Args:
@@ -69,15 +69,15 @@ class PosePrior(ParameterBlock):
         """The centre of the turn where the expected pose puts it, (3,)."""
         return self.mean.apply(self.centre[None])[0]
 
-    def columns(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
-        """See `ParameterBlock.columns`.
+    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+        """See `ParameterBlock.jacobian`.
 
         What the camera sees stays where it is: in the body's coordinates it moves against the pose.
         """
         along = slopes.along @ at.rotation.T  # in the camera's axes
-        found: Floats = np.einsum("pi,pij->pj", along, self.jacobian(own, slopes.places))
+        found: Floats = np.einsum("pi,pij->pj", along, self.seen_jacobian(own, slopes.places))
         if slopes.are_directions:
-            found -= np.einsum("pi,pij->pj", along, self.jacobian(own, np.zeros_like(slopes.places)))
+            found -= np.einsum("pi,pij->pj", along, self.seen_jacobian(own, np.zeros_like(slopes.places)))
         return found
 
     def moved(self, at: Evaluation, change: Floats, every: int) -> Floats:

@@ -68,7 +68,7 @@ def _approached(
     it is of L-BFGS, which wants the whole body's slopes.
     """
     spent: list[SolverResult] = []
-    for _ in range(ACCURACY.anchors):
+    for _ in range(ACCURACY.expansion_points):
         if problem.inputs is not None or not isinstance(solver, GaussNewton):
             break
         place = near.coefficients[problem.force_part]

@@ -198,7 +198,7 @@ def test_one_contact(folder: Path, tmp_path: Path) -> None:
         (["--parameter", "moved"], "expected moved@NODES, got"),
         (["--parameter", "moved@grip"], "expected moved@ one of"),
         (["--parameter", "young-modulus@tumour"], "expected an inner surface among"),
-        (["--parameter", "young-modulus", "--parameter", "young-modulus=0.2"], "expected each unknown once"),
+        (["--parameter", "young-modulus", "--parameter", "young-modulus=0.2"], "expected each input once"),
         (["--parameter", "contact"], "expected at least one"),
         (["--parameter", "young-modulus", "--known-forces", "cloud_0.npy"], r"expected finite numbers of shape"),
     ],

@@ -28,10 +28,11 @@ from softtwin.meshes.io import write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import LinearResponse
 from softtwin.reference.data.writing import create, write_block
+from softtwin.registration.hyperparameters import Hyperparameters
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.parameters.block import Estimate
 from softtwin.registration.pose import Pose
-from softtwin.registration.result import Registration
+from softtwin.registration.result import Moved, Registration
 from softtwin.registration.uncertainty import Uncertainty
 from softtwin.registration.verdict import Check, Code, Judgement, Verdict
 
@@ -171,31 +172,20 @@ def make_registration(folder: Path, body: Body, frames: int = 4, entries: dict[s
             refused = number == 1
             verdict = Judgement.of((some_check(refused),))
             state = SimpleNamespace(displacement=shape)
-            result = Registration(
-                prepared=None,  # type: ignore[arg-type]
-                evaluation=None,  # type: ignore[arg-type]
-                forces=np.full_like(shape, 0.01),
-                state=state,  # type: ignore[arg-type]
-                correction=np.zeros_like(shape),
-                discrepancy_scale=1.0,
-                pose=Pose.identity(),
-                pose_correction=Pose.identity(),
-                net_force=np.array([0.0, 0.3, 0.4]),
-                net_force_covariance=1e-4 * np.eye(3),
-                noise=5e-3 if refused else 5e-4,
-                force_scale=0.01,
+            forces, net, covariance = np.full_like(shape, 0.01), np.array([0.0, 0.3, 0.4]), 1e-4 * np.eye(3)
+            still, shift = Pose.identity(), np.zeros_like(shape)
+            moved = Moved(state, shift, still, still, forces, net, covariance)  # type: ignore[arg-type]
+            scales = Hyperparameters(5e-3 if refused else 5e-4, 0.01, 1e-6, 0.1, 1.0)
+            solved = SimpleNamespace(
+                local=SimpleNamespace(problem=SimpleNamespace(shared=None, pose=None, cloud=np.zeros((100, 3)))),
+                posterior=SimpleNamespace(scales=scales, informed=3.0),
                 rms_distance=float("nan") if refused else 5e-4,
-                outliers=0.0,
-                informed=3.0,
-                points=100,
+                is_kept=np.ones(100, dtype=bool),
                 outcome=Outcome.CONVERGED,
-                judgement=verdict,
                 evaluations=5,
-                seconds=0.1,
                 trace=(),
-                problem=SimpleNamespace(shared=None, pose=None),  # type: ignore[arg-type]
-                posterior=None,  # type: ignore[arg-type]
             )
+            result = Registration(moved, solved, verdict, None, 0.1)  # type: ignore[arg-type]
             vars(result).update(
                 uncertainty=Uncertainty(1e-3 * np.ones((shape.size, 1)), np.zeros(len(shape))),
                 estimates=(Estimate("Young's modulus", "Pa", 4000.0, (3900.0, 12345.0), 0.3, 0.2),),

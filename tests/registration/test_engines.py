@@ -81,7 +81,7 @@ def test_all_engines_stop_by_one_rule_within_what_is_uncertain(body: Body, truth
     both = engine(Bent(body, 1.2), Bent(body))
     rule = GaussNewton()
     exact = both.exact.limited(np.inf)
-    exact.options = replace(exact.options, solver=rule)
+    exact.setup = replace(exact.setup, options=replace(exact.options, solver=rule))
     same = HybridRegistrar(both.fast, exact)
     found, alone = same.register(cloud), exact.register(cloud)
     for result in (found, alone, found.draft):

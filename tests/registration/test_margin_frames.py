@@ -185,7 +185,7 @@ def test_margins_hold_in_both_frames(free: Registrar) -> None:
 def test_an_exact_pose_only_turns_the_axes(body: Body, rng: np.random.Generator) -> None:
     forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(FORCE, 0.0), 0.1)
     made = Registrar(Cantilever(body), SurfaceDistance(body, body.surfaces["observed"]), forces, options())
-    found = replace(made.register(cloud_on(body, np.zeros_like(body.points), 200, rng, NOISE)), pose=CAMERA)
+    found = made.register(cloud_on(body, np.zeros_like(body.points), 200, rng, NOISE)).seen_from(CAMERA)
     turned = CAMERA.rotation @ found.uncertainty.covariances() @ CAMERA.rotation.T
     np.testing.assert_allclose(found.camera_uncertainty.covariances(), turned, atol=1e-12 * turned.max())
     np.testing.assert_allclose(found.camera_uncertainty.margin(), found.uncertainty.margin(), rtol=1e-9)

@@ -233,4 +233,4 @@ def test_who_is_called_converged_has_no_step_left(body: Body) -> None:
         truth = made.model.solve(forces).displacement
         result = made.register(cloud_on(body, truth, 200, rng, 1e-4))
         assert result.outcome is Outcome.CONVERGED and result.local is not None
-        assert result.local.length < GaussNewton.enough
+        assert result.local.length < GaussNewton().enough
