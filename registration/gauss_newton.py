@@ -14,6 +14,7 @@ from softtwin.reference.data.outcome import NotConverged
 
 from .evaluation import Evaluation
 from .hyperparameters import LENGTH, SHARED
+from .laplace import posterior
 from .local_model import LocalModel, without_shared_noise
 from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
@@ -75,7 +76,7 @@ class SolverResult:
         cls, local: LocalModel, outcome: Outcome, evaluations: int, trace: tuple[IterationRecord, ...]
     ) -> SolverResult:
         """What is found where a model of the objective was taken."""
-        return cls(local.evaluation, local.weights, local.posterior(), outcome, evaluations, trace, local)
+        return cls(local.evaluation, local.weights, posterior(local), outcome, evaluations, trace, local)
 
     @property
     def is_kept(self) -> NDArray[np.bool_]:

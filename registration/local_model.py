@@ -17,7 +17,6 @@ from .evidence import Evidence, LinearProblem
 from .hyperparameters import DISCREPANCY, LENGTH, NOISE, SHARED, Hyperparameters
 from .loss import Loss
 from .policy import ACCURACY
-from .posterior import Posterior
 from .problem import Problem
 from .residuals.term import ResidualTerm
 
@@ -64,7 +63,7 @@ class LocalModel:
         self._groups, self.rough = _grouped(problem.rough(evaluation))
         start = problem.hyperprior.within(starts[0]) if len(starts) else _believed(problem, noise)
         self.counted: Floats  # weights that what the points tell is summed with, (p,)
-        self._evidence = self._evidence_near(start, noise)
+        self.evidence = self._evidence_near(start, noise)
         if is_held:
             self.eta, self.is_graduated = start, False
         else:
@@ -75,8 +74,8 @@ class LocalModel:
         residuals = problem.residuals(evaluation, self.own)
         self.weights = loss.weight(residuals / self.deviations)
         if np.abs(self.weights - self.counted).sum() > ACCURACY.summed * self.weights.sum():
-            summed = replace(self._evidence_of(residuals, self.weights).problem, tail=self._evidence.problem.tail)
-            self._evidence, self.counted = replace(self._evidence, problem=summed), self.weights
+            summed = replace(self._evidence_of(residuals, self.weights).problem, tail=self.evidence.problem.tail)
+            self.evidence, self.counted = replace(self.evidence, problem=summed), self.weights
         self.precision = np.exp(-problem.prior_variances(self.eta)[0])
         self._inform()
         self.gradient = self._gradient(residuals, self.weights)
@@ -126,7 +125,7 @@ class LocalModel:
 
     def _found(self, graduation: float, starts: list[Floats]) -> tuple[Floats, bool]:
         """Logarithms of the hyperparameters, and whether the noise is held above what the model would believe."""
-        evidence = self._evidence
+        evidence = self.evidence
         eta = evidence.maximum(starts)
         self.own = float(np.exp(eta[NOISE]))
         minimum = np.log(max(graduation * self._promised(evidence, eta), 1e-300))
@@ -174,7 +173,7 @@ class LocalModel:
         return np.asarray(root * (vectors @ (vectors.T @ (root * right) / np.maximum(values, 1.0)[:, None])))
 
     @cached_property
-    def _inverse(self) -> Floats:
+    def inverse(self) -> Floats:
         """Of the Hessian."""
         return self.solved(np.eye(self.problem.size))
 
@@ -224,8 +223,8 @@ class LocalModel:
 
     def _inform(self) -> None:
         """What the points tell by the weights that they were counted with, and what was believed."""
-        self._informed = self._evidence.problem.weighted(np.exp(-self._evidence.noise(self.eta)[0]))[0]
-        self._hessian = self._informed + np.diag(self.precision)
+        self.informed = self.evidence.problem.weighted(np.exp(-self.evidence.noise(self.eta)[0]))[0]
+        self._hessian = self.informed + np.diag(self.precision)
 
     def _damped(self, damping: float) -> Floats:
         values, vectors = self._eigen
@@ -249,43 +248,6 @@ class LocalModel:
     def largest_movement(self, change: Floats) -> float:
         """Largest predicted movement of an observed node, metres."""
         return float(self.problem.moved(self.linearised_at, change).max())
-
-    def posterior(self) -> Posterior:
-        """Laplace's approximation at the trial, with what the doubt of the hyperparameters moves."""
-        covariance = self._inverse
-        shares = np.einsum("ij,ji->i", covariance, self._informed)
-        informed = float(shares[self.problem.moving].sum())
-        moved, spread = self._by_hyperparameters(covariance)
-        covariance = self.error_covariance() + moved @ spread @ moved.T
-        return Posterior(self.evaluation.coefficients, covariance, self.scales, informed)
-
-    def error_covariance(self) -> Floats:
-        """Of this estimate, (k, k), where the model errs as much as it was seen to, though the cloud tells less.
-
-        The estimate S (J' W D^-1 y) errs by S (P V P + J' W D^-1 D' D^-1 J) S with the larger variances V and D' of
-        the model's error in place of those that it was made with, 1 / P and D: S itself where they are the same.
-        """
-        covariance = self._inverse
-        if self.problem.error is None or self.scales.discrepancy >= 1.0:
-            return covariance
-        whole = self.eta.copy()
-        whole[DISCREPANCY] = np.log(self.scales.margin_discrepancy)
-        held = self.precision**2 * np.exp(self.problem.prior_variances(whole)[0])
-        believed, seen = (self._evidence.noise(each)[0] for each in (self.eta, whole))
-        told = self._evidence.problem.weighted(np.exp(seen - 2.0 * believed))[0]
-        return covariance @ (np.diag(held) + told) @ covariance
-
-    def _by_hyperparameters(self, covariance: Floats) -> tuple[Floats, Floats]:
-        """Derivative of the mean by the logarithms of the hyperparameters, (k, h), and their covariance, (h, h)."""
-        _, slopes = self.problem.prior_variances(self.eta)
-        held = self.precision * self.evaluation.coefficients
-        columns = (slopes * held).T
-        residuals = self.problem.residuals(self.evaluation, self.own)
-        share = (self.noise / self.deviations) ** 2  # of a distance's variance that is its own noise
-        weighted = self.weights * residuals / self.deviations**2
-        columns[:, NOISE] = 2.0 * (share * weighted) @ self.jacobian
-        columns[:, DISCREPANCY] += 2.0 * ((1.0 - share) * weighted) @ self.jacobian
-        return covariance @ columns, self._evidence.covariance(self.eta)
 
 
 def without_shared_noise(problem: Problem, noise: float, eta: Floats | None = None) -> Floats:

@@ -15,6 +15,7 @@ from softtwin.meshes.embedding import embed
 from softtwin.meshes.shapes import beam
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.laplace import posterior
 from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Square
 from softtwin.registration.options import RegistrationOptions, SparseLocalisation
@@ -71,7 +72,7 @@ def independent(found: Registration) -> Registration:
     local = found.local
     assert local is not None
     there = LocalModel(found.problem, found.evaluation, Square(), local.noise, starts=[local.eta], own=local.own)
-    return replace(found, solved=replace(found.solved, posterior=there.posterior(), local=there))
+    return replace(found, solved=replace(found.solved, posterior=posterior(there), local=there))
 
 
 @pytest.mark.parametrize("force", [1e-3, 5e-3, 1e-1])

@@ -13,6 +13,7 @@ from softtwin.meshes.body import Body
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
+from softtwin.registration.laplace import posterior
 from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Huber, Loss, Square, Tukey, robust_deviation
 from softtwin.registration.options import NOISE
@@ -129,7 +130,7 @@ def test_without_data_the_posterior_is_the_prior(body: Body, rng: np.random.Gene
     given = problem(body, rng, cloud=far, blocks=(pose, error, CorrelatedNoise(observed.modes)), noise=NOISE)
     local = LocalModel(given, given.evaluation(np.zeros(given.size)), Tukey(), 1e-3)
     assert not local.weights.any()
-    found, hyperprior = local.posterior(), given.hyperprior
+    found, hyperprior = posterior(local), given.hyperprior
     np.testing.assert_allclose(local.eta, hyperprior.median, atol=0.05)
     shared = POLICY.shared_size**2 * np.exp(observed.modes.spread(local.scales.length)[0])
     variances = [np.full(given.forces.size, 0.05**2), np.ones(6 + 2), np.exp(error.rest.logs), np.tile(shared, 3)]
@@ -173,7 +174,7 @@ def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(body: Body, rng: np.ra
 
     slope = (mean(force * np.exp(1e-4)) - mean(force * np.exp(-1e-4))) / 2e-4
     alone = np.linalg.inv(local.jacobian.T @ local.jacobian / local.noise**2 + np.eye(len(slope)) / force**2)
-    added = local.posterior().covariance - alone
+    added = posterior(local).covariance - alone
     wanted = np.outer(slope, slope) / curvature
     np.testing.assert_allclose(added, wanted, atol=0.03 * np.abs(wanted).max())
     assert np.trace(wanted) > 0.1 * np.trace(alone)

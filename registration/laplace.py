@@ -1,0 +1,56 @@
+"""Laplace's approximation where a solver ended: a normal law of the coefficients, with the hyperparameters' doubt."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .hyperparameters import DISCREPANCY, NOISE
+from .local_model import LocalModel
+from .posterior import Posterior
+
+Floats = NDArray[np.float64]
+
+
+def posterior(local: LocalModel) -> Posterior:
+    """The normal law at a trial, with what the doubt of the hyperparameters moves.
+
+    Args:
+        local: the objective's model there.
+    """
+    shares = np.einsum("ij,ji->i", local.inverse, local.informed)
+    informed = float(shares[local.problem.moving].sum())
+    moved, spread = _by_hyperparameters(local)
+    covariance = error_covariance(local) + moved @ spread @ moved.T
+    return Posterior(local.evaluation.coefficients, covariance, local.scales, informed)
+
+
+def error_covariance(local: LocalModel) -> Floats:
+    """Of this estimate, (k, k), where the model errs as much as it was seen to, though the cloud tells less.
+
+    The estimate S (J' W D^-1 y) errs by S (P V P + J' W D^-1 D' D^-1 J) S with the larger variances V and D' of the
+    model's error in place of those that it was made with, 1 / P and D: S itself where they are the same.
+
+    Args:
+        local: the objective's model at the end.
+    """
+    if local.problem.error is None or local.scales.discrepancy >= 1.0:
+        return local.inverse
+    whole = local.eta.copy()
+    whole[DISCREPANCY] = np.log(local.scales.margin_discrepancy)
+    held = local.precision**2 * np.exp(local.problem.prior_variances(whole)[0])
+    believed, seen = (local.evidence.noise(each)[0] for each in (local.eta, whole))
+    told = local.evidence.problem.weighted(np.exp(seen - 2.0 * believed))[0]
+    return local.inverse @ (np.diag(held) + told) @ local.inverse
+
+
+def _by_hyperparameters(local: LocalModel) -> tuple[Floats, Floats]:
+    """Derivative of the mean by the logarithms of the hyperparameters, (k, h), and their covariance, (h, h)."""
+    _, slopes = local.problem.prior_variances(local.eta)
+    columns = (slopes * (local.precision * local.evaluation.coefficients)).T
+    residuals = local.problem.residuals(local.evaluation, local.own)
+    share = (local.noise / local.deviations) ** 2  # of a distance's variance that is its own noise
+    weighted = local.weights * residuals / local.deviations**2
+    columns[:, NOISE] = 2.0 * (share * weighted) @ local.jacobian
+    columns[:, DISCREPANCY] += 2.0 * ((1.0 - share) * weighted) @ local.jacobian
+    return local.inverse @ columns, local.evidence.covariance(local.eta)
