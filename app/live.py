@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -83,10 +84,12 @@ def register_live(
         CloudError: none of the clouds could be registered at all; their frames are written all the same.
         ConfigError: a budget that is no positive number; landmarks that this twin cannot take.
     """
-    sequence = Sequence(twin, zone, camera, is_live=True)
     if frame_landmarks is not None:
         frame_landmarks.check(twin)
-    with Recorder(Exporter(twin, output, formats), zone) as recorder:
+    with (
+        closing(Sequence(twin, zone, camera, is_live=True)) as sequence,
+        Recorder(Exporter(twin, output, formats), zone) as recorder,
+    ):
         for answer in answers(sequence, box, budget, frame_landmarks=frame_landmarks):
             figures = {"age_s": answer.age, "dropped": answer.dropped, "is_late": answer.is_late}
             row = recorder.figures(answer.frame, answer.cloud, **figures)

@@ -26,9 +26,8 @@ from softtwin.registration.cloud import Cloud, turned
 from softtwin.registration.contact import ContactRegistrar
 from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.hybrid import HybridRegistrar
-from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
-from softtwin.registration.options import NOISE, RegistrationOptions, expected_force, options_for
+from softtwin.registration.options import RegistrationOptions, expected_force, noise_prior, options_for
 from softtwin.registration.parameters.inputs import InputBlocks
 from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.penalties import PENALTIES
@@ -524,6 +523,15 @@ class TwinWays:
         camera = self.camera if isinstance(self.camera, PosePrior) else None
         return _registrar(self.twin.registrar(self.zone, camera)).is_lost(found, last)
 
+    def is_missed(self, found: Registration) -> bool:
+        """Whether it has to be asked if forces outside the zone explain what is left: see `Registrar.is_missed`."""
+        camera = self.camera if isinstance(self.camera, PosePrior) else None
+        return _registrar(self.twin.registrar(self.zone, camera)).is_missed(found)
+
+    def asked(self, cloud: ArrayLike, found: Registration) -> Registration:
+        """The result with the answer to that: see `Registrar.asked`."""
+        return self._run(cloud, lambda engine, points: _registrar(engine).asked(points, found))
+
     def _run(self, cloud: ArrayLike, follow: Callable[[Engine, Floats], Registration]) -> Registration:
         def run(registrar: Engine, points: Floats) -> Registration:
             limited = registrar.limited(self.until) if self.until < np.inf else registrar
@@ -556,6 +564,10 @@ class Sequence:
         engine = twin.registrar(zone)  # a zone that is not there is said before the first cloud
         is_concurrent = isinstance(engine, Registrar) and bool(getattr(engine.model, "is_concurrent", False))
         self._tracker = Tracker(background=is_live and is_concurrent)
+
+    def close(self) -> None:
+        """End: what is still searched for beside the frames is forgotten."""
+        self._tracker.close()
 
     def register(self, cloud: ArrayLike, until: float = np.inf, landmarks: Landmarks | None = None) -> Frame:
         """The next frame; refused, with the reason, where the cloud cannot be registered.
@@ -607,8 +619,9 @@ def _takes_marks(registrar: Engine) -> Registrar | HybridRegistrar:
 
 
 def _options(section: RegistrationSection, suited: RegistrationOptions) -> RegistrationOptions:
-    spread = 0.0 if section.noise_known else NOISE.spread
-    noise = LogNormalPrior(section.noise, spread, minimum=min(NOISE.minimum, section.noise))
+    usual = noise_prior(section.noise)
+    spread = 0.0 if section.noise_known else usual.spread
+    noise = replace(usual, spread=spread, minimum=min(usual.minimum, section.noise))
     solver = suited.solver
     if section.penalty != "prior":
         solver = LBFGS(penalty=PENALTIES[section.penalty](section.alpha))

@@ -39,7 +39,7 @@ from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.loss import Square
-from softtwin.registration.options import NOISE, expected_force
+from softtwin.registration.options import expected_force, noise_prior
 from softtwin.registration.parameters.input_block import InputBlock
 from softtwin.registration.parameters.inputs import InputBlocks
 from softtwin.registration.parameters.nodal_forces import known_forces, nodal_forces
@@ -234,7 +234,7 @@ def force(body: Body, count: int) -> dict[str, Any]:
             begun = -forces[unknown.nodes].ravel() if place % 2 == 0 else 1e-2 * rng.standard_normal(unknown.size)
             clock = time.perf_counter()
             try:
-                search = Search.of(reduced, observed, cloud, NOISE, (unknown,))
+                search = Search.of(reduced, observed, cloud, noise_prior(), (unknown,))
                 ended = GaussNewton().solve(search, begun)
                 solved = ended.evaluations
                 if ended.evaluation.match.rms > _LEFT:  # as `Registrar.follow` does where a start leads astray

@@ -43,8 +43,7 @@ from softtwin.reference.model_error import ModelErrorEnsemble, differences
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 from softtwin.registration.forward import ForwardModel
 from softtwin.registration.hybrid import HybridRegistrar
-from softtwin.registration.hyperparameters import LogNormalPrior
-from softtwin.registration.options import NOISE, expected_force, options_for
+from softtwin.registration.options import expected_force, noise_prior, options_for
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.result import Registration
 from softtwin.surrogate.discrepancy import beside
@@ -147,7 +146,7 @@ def registrars(row: Row, twin: Path, ranks: int) -> Iterator[dict[str, Registrar
         def alone(model: ForwardModel, zone: NDArray[np.int64]) -> Registrar:
             options = options_for(model, has_zone=True)
             if row.noise is not None:
-                options = replace(options, noise=LogNormalPrior(row.noise, NOISE.spread, minimum=row.noise))
+                options = replace(options, noise=replace(noise_prior(row.noise), minimum=row.noise))
             return prepare(
                 model,
                 zone,

@@ -94,9 +94,8 @@ def _fit(problem: Problem, found: SolverResult, expected: Expectations) -> Itera
         unit="m",
         law=_log_normal(noise, problem.noise),
     )
-    systematic = noise  # of which neighbours share a part
-    if systematic > expected.systematic:
-        systematic *= np.sqrt(shared(problem.observed.closest_points(match), match.distances, found.weights))
+    part = shared(problem.observed.closest_points(match), match.distances, found.weights)
+    systematic = noise * float(np.sqrt(part))
     yield checked(
         Code.SPATIAL_CORRELATION,
         systematic,

@@ -27,7 +27,8 @@ class Evaluation:
         state: the body's state as the model has it.
         positions: displacement of the observed nodes with what blocks add to the state, (m, 3), metres.
         pose: from the body's coordinates to the cloud's; None where it is not unknown.
-        cloud: points in the body's coordinates, (p, 3), metres.
+        given: points as they were given, (p, 3), metres: the array tells which cloud it is.
+        cloud: the same in the body's coordinates, (p, 3), metres.
         match: the cloud on the surface.
         stiffness_scaling: factor of the nodal forces by the body's stiffness.
     """
@@ -37,10 +38,11 @@ class Evaluation:
     state: ReducedState
     positions: Floats
     pose: Pose | None
+    given: Floats
     cloud: Floats
     match: Correspondence
     stiffness_scaling: float = 1.0
-    _known: dict[Any, Floats] = field(default_factory=dict, init=False, repr=False)
+    _cache: dict[Any, Floats] = field(default_factory=dict, init=False, repr=False)
 
     def once(self, key: Any, found: Callable[[], Floats]) -> Floats:
         """What depends on this trial alone, found when it is first asked for.
@@ -49,9 +51,9 @@ class Evaluation:
             key: names it.
             found: finds it.
         """
-        if key not in self._known:
-            self._known[key] = found()
-        return self._known[key]
+        if key not in self._cache:
+            self._cache[key] = found()
+        return self._cache[key]
 
     @property
     def rotation(self) -> Floats:

@@ -368,7 +368,7 @@ class _Search:
 def _begun(problem: Problem, start: Floats, near: Evaluation | None) -> Evaluation:
     """The trial at the start: the one given, where it is of this cloud and has just these coefficients."""
     sized = problem.sized(start)
-    if near is None or near.cloud is not problem.cloud:
+    if near is None or near.given is not problem.cloud:
         return problem.evaluation(sized, near, anew=True)
     if near.coefficients is not start:
         return problem.evaluation(sized, near)

@@ -58,7 +58,7 @@ class LocalModel:
         self.was_whole, self.own = True, noise if own is None else own
         self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
         told = [_told(problem, evaluation, term, loss) for term in problem.terms]
-        self._known = np.sum([each[0] for each in told], axis=0) if told else None
+        self._by_terms = np.sum([each[0] for each in told], axis=0) if told else None
         self._beside: Floats | float = np.sum([each[1] for each in told], axis=0) if told else 0.0
         self._groups, self.rough = _grouped(problem.rough(evaluation))
         start = problem.hyperprior.within(starts[0]) if len(starts) else _believed(problem, noise)
@@ -111,7 +111,7 @@ class LocalModel:
         data = self.jacobian @ coefficients - residuals
         root = np.sqrt(weights)
         parts = [root[group, None] * self.jacobian[group] for group in groups]
-        known = None if self._known is None else (self._known, self._known @ coefficients - self._beside)
+        known = None if self._by_terms is None else (self._by_terms, self._by_terms @ coefficients - self._beside)
         linear = LinearProblem(
             np.stack([part.T @ part for part in parts]),
             np.stack([(root[group] * data[group]) @ part for group, part in zip(groups, parts, strict=True)]),
@@ -216,8 +216,8 @@ class LocalModel:
             other.__dict__.pop(name, None)
         residuals = self.problem.residuals(evaluation, self.own)
         other.evaluation, other.weights = evaluation, self.loss.weight(residuals / self.deviations)
-        if self._known is not None:
-            other._beside = self._beside + self._known @ (evaluation.coefficients - self.evaluation.coefficients)
+        if self._by_terms is not None:
+            other._beside = self._beside + self._by_terms @ (evaluation.coefficients - self.evaluation.coefficients)
         other.gradient = other._gradient(residuals, other.weights)
         return other
 

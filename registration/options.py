@@ -31,9 +31,6 @@ def noise_prior(median: float = NOISE_MEDIAN) -> LogNormalPrior:
     return LogNormalPrior(median, POLICY.noise_spread, minimum=POLICY.noise_minimum)
 
 
-NOISE = noise_prior()
-
-
 @dataclass(frozen=True)
 class SparseLocalisation:
     """How a cold start finds where forces act: they are expected again where a round before has found some.

@@ -41,7 +41,7 @@ class Prepared:
         return cls(forces, reduce_model(model, observed.nodes, forces.basis, inputs))
 
     def informed(self, observed: SurfaceDistance, rule: LikelihoodInformed) -> Prepared:
-        """The directions that a cloud can tell: see `unknowns.likelihood_informed`."""
+        """The directions that a cloud can tell: see `likelihood_informed`."""
         kept = likelihood_informed(self.model, observed, rule)
         return Prepared(self.forces.combined(kept), self.model.combined(kept))
 

@@ -152,7 +152,7 @@ class Problem(ParameterStack):
         pose = None if self.pose is None else self.pose.pose(coefficients[self.pose_part])
         cloud = self.cloud if pose is None else pose.inverse().apply(self.cloud)
         match = matched(positions, cloud)
-        return Evaluation(coefficients, self.observed, state, positions, pose, cloud, match, scaling)
+        return Evaluation(coefficients, self.observed, state, positions, pose, self.cloud, cloud, match, scaling)
 
     def _state(self, coefficients: Floats, near: ReducedState | None) -> tuple[ReducedState, float]:
         """The model's state, and by what factor it has scaled the forces."""

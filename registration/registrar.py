@@ -122,7 +122,7 @@ class Registrar:
     def with_pose(self, pose: PosePrior, options: RegistrationOptions) -> Registrar:
         """The same with an unknown pose, and the options that suit it."""
         anywhere, setup = self.anywhere, self.setup
-        return Registrar(
+        posed = Registrar(
             setup.model,
             setup.observed,
             setup.forces,
@@ -134,6 +134,7 @@ class Registrar:
             modulus_deviation=self.modulus_deviation,
             anywhere=None if anywhere is None else lambda: anywhere().with_pose(pose, options),
         )
+        return posed.with_terms(*setup.terms)
 
     def _with(self, setup: Setup) -> Registrar:
         other = copy.copy(self)
@@ -173,10 +174,10 @@ class Registrar:
             CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
             NotConverged: the model found no state at the start.
         """
-        return self._asked(cloud, self._registered(cloud, start))
+        return self.asked(cloud, self._registered(cloud, start))
 
     def track(self, cloud: ArrayLike, last: Registration) -> Registration:
-        """The next frame of a sequence from the last one alone; see `Tracker`.
+        """The next frame of a sequence from the last one alone, with forces in the zone alone; see `Tracker`.
 
         Args:
             cloud: observed points, (p, 3), metres.
@@ -187,7 +188,7 @@ class Registrar:
             NotConverged: the model found no state there.
         """
         begin = time.perf_counter()
-        return self._asked(cloud, self._concluded(track(self.setup, self.setup.checked(cloud), last), begin))
+        return self._concluded(track(self.setup, self.setup.checked(cloud), last), begin)
 
     def is_lost(self, found: Registration, last: Registration) -> bool:
         """Whether what was tracked has to be searched for from rest: it is not accepted, or met much worse.
@@ -237,7 +238,40 @@ class Registrar:
         """
         begin = time.perf_counter()
         ended = refine(self.setup, self.setup.checked(cloud), draft, fast, last)
-        return replace(self._concluded(ended, begin), draft=draft)
+        return self.asked(cloud, replace(self._concluded(ended, begin), draft=draft))
+
+    def is_missed(self, found: Registration) -> bool:
+        """Whether forces in the zone leave what neighbouring points share, and those elsewhere may explain it.
+
+        Args:
+            found: a result with forces in the zone alone.
+        """
+        if self.anywhere is None or not found.judgement.is_usable:
+            return False
+        match = found.evaluation.match  # with those points that were taken for outliers: patches of them are none
+        part = shared(self.setup.observed.closest_points(match), match.distances, np.ones(len(match.distances)))
+        return match.rms * np.sqrt(part) > self.setup.noise.minimum
+
+    def asked(self, cloud: ArrayLike, found: Registration) -> Registration:
+        """A result, doubtful where forces elsewhere explain what it leaves: a second registration where it is missed.
+
+        Args:
+            cloud: that it is of, (p, 3), metres.
+            found: the result.
+        """
+        if not self.is_missed(found) or self.anywhere is None or self.setup.is_late:
+            return found
+        try:
+            anywhere = self.anywhere()
+        except ValueError:  # a network has learned no forces there
+            return found
+        solver = self.options.solver
+        with suppress(NotConverged):
+            hurried = anywhere._with(anywhere.setup.with_solver(until=solver.until, before_step=solver.before_step))
+            other = hurried.with_terms(*self.setup.terms).register(cloud)
+            if other.judgement.is_usable:
+                return found.with_check(_elsewhere(found.evaluation.match.rms, other.evaluation.match.rms))
+        return found
 
     # ------------------------------------------------------------------ which strategy
 
@@ -268,26 +302,6 @@ class Registrar:
 
     def _concluded(self, ended: Ended, begin: float) -> Registration:
         return conclude(self.setup, ended, self.modulus_deviation, time.perf_counter() - begin)
-
-    def _asked(self, cloud: ArrayLike, found: Registration) -> Registration:
-        """The result, doubtful where forces elsewhere explain what the cloud has left and neighbours share."""
-        setup = self.setup
-        if self.anywhere is None or not found.judgement.is_usable:
-            return found
-        match = found.evaluation.match  # with those points that were taken for outliers: patches of them are none
-        inflation_factor = shared(setup.observed.closest_points(match), match.distances, np.ones(len(match.distances)))
-        is_missed = match.rms * np.sqrt(inflation_factor) > setup.noise.minimum
-        if not is_missed or setup.is_late:
-            return found
-        try:
-            anywhere = self.anywhere()
-        except ValueError:  # a network has learned no forces there
-            return found
-        with suppress(NotConverged):
-            other = anywhere.limited(setup.options.solver.until).with_terms(*setup.terms).register(cloud)
-            if other.judgement.is_usable:
-                return found.with_check(_elsewhere(match.rms, other.evaluation.match.rms))
-        return found
 
 
 def prepare(
@@ -330,7 +344,7 @@ def prepare(
     spread = POLICY.force_spread_anywhere if is_anywhere else POLICY.force_spread
     scale = LogNormalPrior(force_scale, spread, minimum=1e-2 * force_scale)
     if nodes is None:
-        if inputs is None and pose is None:
+        if inputs is None and pose is None and blocks is None:
             raise ValueError("prepare.nodes: expected nodes that may carry force where nothing else is unknown.")
         options = replace(options, localisation=replace(options.localisation, rounds=0))
         forces = known_forces(model.body, scale)

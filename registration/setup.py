@@ -72,7 +72,7 @@ class Setup:
         blocks: further parameters.
         terms: what pulls beside the clouds.
         error: what the model gets wrong; None where it is not known in patterns.
-        everywhere: the forces, with the model that they are reduced with.
+        unlocalised: the forces, with the model that they are reduced with.
     """
 
     model: ForwardModel
@@ -86,7 +86,7 @@ class Setup:
     blocks: tuple[ParameterBlock, ...]
     terms: tuple[ResidualTerm, ...]
     error: ModelError | None
-    everywhere: Prepared
+    unlocalised: Prepared
     _fast: list[tuple[ForwardModel, NodalForces, ReducedModel]] = field(default_factory=list, repr=False)
 
     @classmethod
@@ -111,8 +111,8 @@ class Setup:
         # Where it is not known what the model gets wrong, points tell no more than the model can meet.
         noise = options.noise.with_minimum(model.error)
         usual = expectations or Expectations.of(model, noise)
-        everywhere = Prepared.of(model, observed, forces, inputs)
-        return cls(model, observed, forces, options, usual, noise, pose, inputs, blocks, (), error, everywhere)
+        unlocalised = Prepared.of(model, observed, forces, inputs)
+        return cls(model, observed, forces, options, usual, noise, pose, inputs, blocks, (), error, unlocalised)
 
     def with_solver(self, **given: object) -> Setup:
         """The same with other values of the solver."""

@@ -21,6 +21,10 @@ _CATCHING_UP = 2  # newest clouds that a search tracks: the first takes longer t
 _LONGEST_WAIT = 0.05  # seconds that a step of a search waits for an answer
 
 
+class _Closed(Exception):  # noqa: N818 - no error
+    """Nobody waits for what is searched for."""
+
+
 class Phase(Enum):
     """What a tracker knows."""
 
@@ -43,6 +47,12 @@ class Ways(Protocol):
 
     def is_lost(self, found: Registration, last: Registration) -> bool:
         """Whether what was tracked has to be searched for from rest."""
+
+    def is_missed(self, found: Registration) -> bool:
+        """Whether it has to be asked if forces outside the zone explain what is left."""
+
+    def asked(self, cloud: ArrayLike, found: Registration) -> Registration:
+        """The result with the answer to that, a check more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +97,9 @@ class Tracker:
     has found better where its result for the cloud that it was begun with is the better one (`badness`), and the one
     for the newest cloud that is tracked from it is, too. Refused results are answers, and nothing follows from them.
 
+    Whether forces outside the zone explain what a tracked frame leaves is asked beside the frames, too, and the answer
+    goes with all frames until the next one is known.
+
     A search takes the time between the frames: each of its steps waits for the answer that is being found, yet no
     longer than 50 ms, so that it ends where clouds come without a pause.
 
@@ -100,8 +113,10 @@ class Tracker:
         self._last: Registration | None = None
         self._search: Future[Registration | None] | None = None
         self._newest: _Tracked | None = None
+        self._inquiry: Future[Registration] | None = None
+        self._elsewhere: Check | None = None
         self._threads: ThreadPoolExecutor | None = None
-        self._is_between = threading.Event()
+        self._is_between, self._is_closed = threading.Event(), False
 
     @property
     def phase(self) -> Phase:
@@ -139,21 +154,43 @@ class Tracker:
         if self._search is None and ways.is_lost(found, self._last):
             self._search = self._begun(self._newest)
         self._kept(found)
+        self._inquire(self._newest)
+        if self._elsewhere is not None:
+            found = found.with_check(self._elsewhere)
         return found if self._search is None else found.with_check(_searching())
+
+    def _inquire(self, tracked: _Tracked) -> None:
+        """Ask beside the frames whether forces elsewhere explain what one leaves, and take the answer to the last."""
+        if self._inquiry is not None and self._inquiry.done():
+            checks = self._inquiry.result().judgement.checks
+            self._elsewhere = next((check for check in checks if check.code is Code.FORCES_ELSEWHERE), None)
+            self._inquiry = None
+        if not tracked.ways.is_missed(tracked.tracked):
+            self._elsewhere = None
+        elif self._inquiry is None:
+            ways = tracked.ways.beside(self._wait)
+            self._inquiry = self._beside().submit(ways.asked, tracked.cloud, tracked.tracked)
 
     def close(self) -> None:
         """End: what is still searched for is forgotten."""
+        self._is_closed = True
+        self._is_between.set()
         if self._threads is not None:
             self._threads.shutdown(wait=True, cancel_futures=True)
-        self._threads, self._search = None, None
+        self._threads, self._search, self._inquiry = None, None, None
 
     def _wait(self) -> None:
         self._is_between.wait(_LONGEST_WAIT)
+        if self._is_closed:
+            raise _Closed
 
     def _begun(self, lost: _Tracked) -> Future[Registration | None]:
+        return self._beside().submit(self._searched, lost)
+
+    def _beside(self) -> ThreadPoolExecutor:
         if self._threads is None:
-            self._threads = ThreadPoolExecutor(1, thread_name_prefix="search from rest")
-        return self._threads.submit(self._searched, lost)
+            self._threads = ThreadPoolExecutor(1, thread_name_prefix="beside the frames")
+        return self._threads
 
     def _searched(self, lost: _Tracked) -> Registration | None:
         """In the other thread: the cloud from rest, then the newest from there, as long as that is better."""

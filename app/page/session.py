@@ -141,6 +141,8 @@ class Session:
         if self.hand is not None:
             self.hand.close()
         self.brush.close()
+        if self._kept is not None:
+            self._kept[1].close()
         self._resources.close()
 
     def _register(self, arrival: Arrival) -> None:
@@ -168,6 +170,8 @@ class Session:
         if self._kept is not None and self._kept[0] == wanted:
             return self._kept[1]
         same = self._kept is not None and self._kept[0][0] == wanted[0]
+        if self._kept is not None:
+            self._kept[1].close()
         twin = self._kept[1].twin if same and self._kept is not None else self._opened(wishes.engine)
         camera = twin.near(Pose.identity()) if wishes.view.is_misaligned else self._camera
         self._kept = wanted, Sequence(twin, None, camera, is_live=True)

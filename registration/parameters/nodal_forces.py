@@ -247,7 +247,7 @@ def _parted_net(parts: Floats, patterns: Floats) -> Floats:
     return axes @ patterns
 
 
-def contact(
+def reweighting(
     forces: NodalForces, nodal: Floats, positions: Floats, reach: float, minimum: float | None = None
 ) -> Floats:
     """Where forces were found, as parts of the largest, (n,): the next prior of forces whose place is unknown.

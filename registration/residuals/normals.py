@@ -51,6 +51,8 @@ class Normals(ResidualTerm):
     def checks(self, at: Evaluation) -> Iterator[Check]:
         """Normals that are none of this surface's: of another frame, say, or columns of something else."""
         known = np.abs(self.tangent_basis).max(axis=(1, 2)) > 0.0
+        if not known.any():
+            return
         leaning = np.linalg.norm(self.values(at).reshape(-1, 2)[known], axis=1) * self.deviation
         median = float(np.rad2deg(np.arcsin(np.minimum(np.median(leaning), 1.0))))
         expected = float(np.rad2deg(np.sqrt(2.0 * np.log(2.0)) * self.deviation))  # Rayleigh's law

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..cloud import Cloud
 from ..gauss_newton import GaussNewton, SolverResult
 from ..lbfgs import LBFGS
-from ..parameters.nodal_forces import contact, localised
+from ..parameters.nodal_forces import localised, reweighting
 from ..policy import ACCURACY
 from ..prepared import Prepared
 from ..problem import Problem
@@ -37,7 +37,7 @@ def localise(setup: Setup, points: Cloud) -> Localised:
         setup: what is registered.
         points: of the cloud.
     """
-    prepared, rule, solver = setup.everywhere, setup.options.localisation, setup.options.solver
+    prepared, rule, solver = setup.unlocalised, setup.options.localisation, setup.options.solver
     few, is_gathered = points.thinned(rule.points), rule.rounds > 0
     begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
     found = from_rest(setup, *begun)
@@ -107,5 +107,5 @@ def _believed(setup: Setup, prepared: Prepared, found: SolverResult) -> Prepared
 def _gathered(setup: Setup, nodal: Floats) -> Prepared:
     """The unknown forces once more, where forces were found."""
     body, rule = setup.model.body, setup.options.localisation
-    where = contact(setup.forces, nodal, body.points, rule.reach * body.size)
+    where = reweighting(setup.forces, nodal, body.points, rule.reach * body.size)
     return setup.prepared(localised(setup.forces, where)).informed(setup.observed, rule.informed)

@@ -39,12 +39,13 @@ def refine(
             place.
     """
     solver = setup.options.solver.following()
-    if last is not None and last.draft is not None and last.draft.prepared is draft.prepared:
+    is_same_place = last is not None and last.draft is not None and last.draft.prepared is draft.prepared
+    if last is not None and is_same_place and last.prepared is not draft.prepared:  # else it is the draft itself
         problem = setup.problem(points, last.prepared, last.evaluation.positions, last.rms_distance)
         near = replace(last.evaluation, coefficients=problem.carried(last.evaluation.coefficients, last.problem))
         return Ended(last.prepared, _approached(setup, problem, near, fast, solver, last.eta))
     # Told a zone, the exact model gathers no forces within it, and takes none that were: see `options_for`.
-    prepared = setup.everywhere
+    prepared = setup.unlocalised
     if setup.options.localisation.rounds:
         prepared = setup.prepared(replace(draft.prepared.forces, scale=setup.forces.scale))
     problem = setup.plain(points, prepared)
@@ -86,6 +87,6 @@ def _approached(
         spent.append(replace(way, evaluations=1))  # states of the exact model alone are counted
         if solver.has_settled(exact, near, way.local.noise, eta):
             break
-    if near.cloud is not problem.cloud:
+    if near.given is not problem.cloud:
         near = problem.begun(near.coefficients.copy(), near)
     return reduce(after, [*spent, solver.solve(problem, near.coefficients, near, eta)])

@@ -22,6 +22,7 @@ from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registrar, register_sequence
+from softtwin.registration.residuals.landmarks import LandmarkPairs
 from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Verdict
 
@@ -203,3 +204,24 @@ def test_a_cloud_of_something_else_is_refused_by_both(body: Body, rng) -> None:
     assert found.judgement.verdict is Verdict.REFUSED
     with pytest.raises(CloudError):
         both.register(np.full((10, 3), np.nan))
+
+
+def test_after_a_frame_without_time_the_exact_model_is_asked_again(body: Body, truth: np.ndarray, rng) -> None:
+    """A frame whose time was over is the fast model's; the next one is the exact model's all the same."""
+    fast, exact = Bent(body, 1.3), Bent(body)
+    both = engine(fast, exact)
+    hurried = engine(fast, exact)
+    hurried.exact = hurried.exact.limited(time.monotonic() - 1.0)
+    late = hurried.register(cloud_on(body, truth, 400, rng, 5e-4))
+    assert late.draft is not None and late.prepared is late.draft.prepared
+    asked = exact.asked
+    found = both.follow(cloud_on(body, truth, 400, rng, 5e-4), late)
+    assert exact.asked > asked and found.draft is not None and found.prepared is not found.draft.prepared
+    assert np.linalg.norm(found.displacement - truth, axis=1).mean() < 1e-3
+
+
+def test_another_pose_keeps_what_pulls_beside_the_cloud(body: Body) -> None:
+    made = engine(Bent(body), Bent(body)).exact
+    marks = LandmarkPairs.of(made.observed, body.points[made.observed.nodes[:3]], body.points[made.observed.nodes[:3]])
+    pose = PosePrior(Pose.identity(), body.points.mean(axis=0))
+    assert made.with_terms(marks).with_pose(pose, made.options).setup.terms == (marks,)

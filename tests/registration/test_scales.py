@@ -16,15 +16,15 @@ from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.laplace import posterior
 from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Huber, Loss, Square, Tukey, robust_deviation
-from softtwin.registration.options import NOISE
+from softtwin.registration.options import noise_prior
 from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
 from softtwin.registration.parameters.discrepancy import ModelError
 from softtwin.registration.parameters.nodal_forces import (
     LikelihoodInformed,
     NodalForces,
-    contact,
     localised,
     nodal_forces,
+    reweighting,
 )
 from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.policy import POLICY
@@ -127,7 +127,7 @@ def test_without_data_the_posterior_is_the_prior(body: Body, rng: np.random.Gene
     error = ModelError(patterns(body), observed)
     pose = PosePrior(Pose.identity(), body.points.mean(axis=0))
     far = cloud_on(body, np.full_like(body.points, 5.0), 50, rng)
-    given = problem(body, rng, cloud=far, blocks=(pose, error, CorrelatedNoise(observed.modes)), noise=NOISE)
+    given = problem(body, rng, cloud=far, blocks=(pose, error, CorrelatedNoise(observed.modes)), noise=noise_prior())
     local = LocalModel(given, given.evaluation(np.zeros(given.size)), Tukey(), 1e-3)
     assert not local.weights.any()
     found, hyperprior = posterior(local), given.hyperprior
@@ -201,7 +201,7 @@ def test_contact_is_where_the_forces_are(body: Body) -> None:
     nodal = np.zeros_like(body.points)
     pulled = forces.nodes[np.argmax(body.points[forces.nodes] @ [1.0, 0.0, 1.0])]
     nodal[pulled] = [0.0, 0.0, 2.0]
-    where = contact(forces, nodal, body.points, reach=0.1, minimum=0.03)
+    where = reweighting(forces, nodal, body.points, reach=0.1, minimum=0.03)
     distance = np.linalg.norm(body.points - body.points[pulled], axis=1)
     free = np.setdiff1d(forces.nodes, [pulled])
     assert where[pulled] == 1.0

@@ -14,7 +14,7 @@ import pytest
 from softtwin.meshes.clouds import CloudError
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.tracker import Phase, Tracker
-from softtwin.registration.verdict import Check, Judgement, Verdict
+from softtwin.registration.verdict import Check, Code, Judgement, Verdict
 
 CLOUD = np.zeros((4, 3))
 LEVELS = {"good": Verdict.ACCEPTED, "odd": Verdict.DOUBTFUL, "wrong": Verdict.REFUSED}
@@ -40,7 +40,8 @@ class Told:
     """Ways whose results are told beforehand; beside the frames they wait until they are let go."""
 
     def __init__(self, **results: Any) -> None:
-        self.results, self.asked, self.go = results, list[tuple[str, str]](), threading.Event()
+        self.results, self.taken, self.go = results, list[tuple[str, str]](), threading.Event()
+        self.asked_of: list[str] = []
         self.before_step: Callable[[], None] | None = None
 
     def beside(self, before_step: Callable[[], None]) -> Told:
@@ -61,8 +62,16 @@ class Told:
     def is_lost(self, found: Any, last: Any) -> bool:
         return bool(found.judgement.verdict is not Verdict.ACCEPTED or found.scatter > 1.5 * last.scatter)
 
+    def is_missed(self, found: Any) -> bool:
+        return "elsewhere" in self.results
+
+    def asked(self, cloud: Any, found: Any) -> Any:
+        assert self.go.wait(10.0)
+        self.asked_of.append(found.name)
+        return found.with_check(self.results["elsewhere"])
+
     def _given(self, way: str, last: Any) -> Any:
-        self.asked.append((way, "" if last is None else last.name))
+        self.taken.append((way, "" if last is None else last.name))
         if isinstance(self.results[way], Exception):
             raise self.results[way]
         return self.results[way]
@@ -109,13 +118,13 @@ def test_the_first_clouds_are_sought_from_rest_until_one_is_usable(tracker: Trac
     assert tracker.take(CLOUD, ways).name == "nothing" and tracker.phase is Phase.LOST  # type: ignore[attr-defined]
     ways.results["follow"] = found("first", "odd")
     assert tracker.take(CLOUD, ways).name == "first" and tracker.phase is Phase.FOLLOWING  # type: ignore[attr-defined]
-    assert ways.asked == [("follow", ""), ("follow", "")]
+    assert ways.taken == [("follow", ""), ("follow", "")]
 
 
 def test_without_a_background_an_answer_waits_for_the_better_one() -> None:
     ways, tracker = Told(follow=found("second", "odd")), following(Tracker())
     assert tracker.take(CLOUD, ways).name == "second"  # type: ignore[attr-defined]
-    assert ways.asked == [("follow", "first")] and tracker.phase is Phase.FOLLOWING
+    assert ways.taken == [("follow", "first")] and tracker.phase is Phase.FOLLOWING
 
 
 def test_an_accepted_cloud_is_tracked_from_the_last(live: Tracker) -> None:
@@ -123,7 +132,7 @@ def test_an_accepted_cloud_is_tracked_from_the_last(live: Tracker) -> None:
     assert following(live).take(CLOUD, ways).judgement.verdict is Verdict.ACCEPTED
     ways.results["track"] = found("third")
     live.take(CLOUD, ways)
-    assert ways.asked == [("track", "first"), ("track", "second")] and live.phase is Phase.FOLLOWING
+    assert ways.taken == [("track", "first"), ("track", "second")] and live.phase is Phase.FOLLOWING
 
 
 @pytest.mark.parametrize("lost", [found("lost", "odd"), found("far", "good", 2e-3)], ids=["doubtful", "met worse"])
@@ -133,7 +142,7 @@ def test_no_answer_waits_for_a_search(live: Tracker, lost: Any) -> None:
     answer = live.take(CLOUD, ways)
     assert answer.name == "meanwhile" and live.phase is Phase.SEARCHING  # type: ignore[attr-defined]
     assert answer.judgement.verdict is Verdict.DOUBTFUL and "searched for" in answer.judgement.reasons[-1]
-    assert [way for way, _ in ways.asked] == ["track", "track"]  # the search waits, and no other was begun
+    assert [way for way, _ in ways.taken] == ["track", "track"]  # the search waits, and no other was begun
 
 
 def test_what_a_search_found_better_is_gone_on_from(live: Tracker) -> None:
@@ -141,7 +150,7 @@ def test_what_a_search_found_better_is_gone_on_from(live: Tracker) -> None:
     ended(live, ways)
     ways.results["track"] = found("next")
     assert live.take(CLOUD, ways).judgement.verdict is Verdict.ACCEPTED
-    assert ways.asked[-1] == ("track", "rest") and live.phase is Phase.FOLLOWING
+    assert ways.taken[-1] == ("track", "rest") and live.phase is Phase.FOLLOWING
 
 
 @pytest.mark.parametrize(
@@ -154,7 +163,7 @@ def test_what_a_search_found_no_better_is_forgotten(live: Tracker, searched: Any
     ended(live, ways)
     ways.results["track"] = found("next")
     live.take(CLOUD, ways)
-    assert ways.asked[-1] == ("track", "lost") and live.phase is Phase.FOLLOWING
+    assert ways.taken[-1] == ("track", "lost") and live.phase is Phase.FOLLOWING
 
 
 @pytest.mark.parametrize(("caught_up", "begun"), [(found("there"), "there"), (found("there", "odd", 5e-3), "second")])
@@ -164,10 +173,10 @@ def test_a_search_catches_up_with_the_newest_cloud(live: Tracker, caught_up: Any
     ways.results |= {"track": found("second", "odd"), "caught_up": caught_up}
     live.take(CLOUD, ways)
     ended(live, ways)
-    assert ways.asked[-1] == ("caught_up", "rest")
+    assert ways.taken[-1] == ("caught_up", "rest")
     ways.results["track"] = found("third")
     live.take(CLOUD, ways)
-    assert ways.asked[-1] == ("track", begun)
+    assert ways.taken[-1] == ("track", begun)
 
 
 def test_a_refused_frame_is_an_answer_and_nothing_follows_from_it(live: Tracker) -> None:
@@ -175,13 +184,13 @@ def test_a_refused_frame_is_an_answer_and_nothing_follows_from_it(live: Tracker)
     ended(live, ways)
     ways.results["track"] = found("next")
     live.take(CLOUD, ways)
-    assert ways.asked[-1] == ("track", "first")
+    assert ways.taken[-1] == ("track", "first")
 
 
 def test_where_the_model_finds_no_state_it_begins_at_rest(live: Tracker) -> None:
     ways = Told(track=NotConverged("none"), follow=found("rest"))
     assert following(live).take(CLOUD, ways).name == "rest"  # type: ignore[attr-defined]
-    assert ways.asked == [("track", "first"), ("follow", "")] and live.phase is Phase.FOLLOWING
+    assert ways.taken == [("track", "first"), ("follow", "")] and live.phase is Phase.FOLLOWING
 
 
 def test_a_fault_of_a_search_is_no_silence(live: Tracker) -> None:
@@ -217,3 +226,28 @@ def test_a_search_waits_for_the_answer_that_is_being_found(live: Tracker) -> Non
     assert ways.waited
     assert live._search is not None
     assert live._search.result(10.0).name == "rest"  # type: ignore[union-attr]
+
+
+def test_whether_forces_act_elsewhere_is_asked_beside_the_frames(live: Tracker) -> None:
+    """No answer waits for it; the last answer goes with all frames until the next is known, or nothing is missed."""
+    doubt = Check(Code.FORCES_ELSEWHERE, Verdict.DOUBTFUL, 0.3, 0.5, reason="forces act elsewhere")
+    ways = Told(track=found("tracked"), elsewhere=doubt)
+    first = following(live).take(CLOUD, ways)
+    assert first.judgement.verdict is Verdict.ACCEPTED and live.phase is Phase.FOLLOWING
+    assert live.take(CLOUD, ways).judgement.verdict is Verdict.ACCEPTED and ways.asked_of == []  # not known yet
+    ways.go.set()
+    assert live._inquiry is not None
+    live._inquiry.exception(10.0)
+    answer = live.take(CLOUD, ways)
+    assert answer.judgement.reasons == ("forces act elsewhere",) and live.phase is Phase.FOLLOWING
+    assert live.take(CLOUD, Told(track=found("met"))).judgement.verdict is Verdict.ACCEPTED  # nothing is missed
+
+
+def test_a_search_that_nobody_waits_for_ends_with_its_next_step(live: Tracker) -> None:
+    ways = searching(live, found("odd", "odd"), found("rest"))
+    search = live._search
+    assert search is not None
+    threading.Timer(0.1, ways.go.set).start()  # while the tracker is being closed
+    live.close()
+    assert type(search.exception(10.0)).__name__ == "_Closed" and live.phase is Phase.FOLLOWING
+    assert ("search", "") not in ways.taken
