@@ -23,6 +23,7 @@ from .gauss_newton import SolverResult
 from .hyperparameters import LogNormalPrior
 from .loss import REJECTED
 from .outcome import Outcome
+from .parameters.block import BlockPosterior
 from .policy import ACCURACY, POLICY
 from .problem import Problem
 from .score import Score, by_rigid_motion, by_scale, score
@@ -47,7 +48,8 @@ def judge(problem: Problem, found: SolverResult, state: State, expected: Expecta
         *_cloud(problem, found, expected),
         *_fit(problem, found, expected),
         *_state(problem, state, expected),
-        *problem.checks(found.evaluation, found.posterior, expected),
+        *_blocks(problem, found, expected),
+        *(check for term in problem.terms for check in term.checks(found.evaluation)),
         *_left_out(problem, found),
     )
     return Judgement.of(checks, Code.CONVERGENCE if found.outcome is Outcome.OUT_OF_TIME else None)
@@ -184,6 +186,14 @@ def _state(problem: Problem, state: State, expected: Expectations) -> Iterator[C
     if pivots is not None:
         unstable = f"the state is unstable: {pivots} negative pivots of its tangent"
         yield checked(Code.STABILITY, pivots, 0.0, unstable, unit="negative pivots")
+
+
+def _blocks(problem: Problem, found: SolverResult, expected: Expectations) -> Iterator[Check]:
+    """What each block of parameters says of what was found of it."""
+    at, covariance, scales = found.evaluation, found.posterior.covariance, found.posterior.scales
+    for block, part in problem.parts:
+        known = BlockPosterior(at, at.coefficients[part], covariance[part, part], scales, problem.forces.size > 0)
+        yield from block.checks(known, expected)
 
 
 def _left_out(problem: Problem, found: SolverResult) -> Iterator[Check]:

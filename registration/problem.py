@@ -12,18 +12,15 @@ from numpy.typing import NDArray
 
 from .evaluation import Evaluation, Slopes
 from .evidence import Hyperprior, Variances
-from .expectations import Expectations
 from .forward import ParametrisedModel, ReducedModel, ReducedState
 from .hyperparameters import DISCREPANCY, NOISE, LogNormalPrior
-from .parameters.block import BlockPosterior, ParameterBlock
+from .parameters.block import ParameterBlock
 from .parameters.correlated_noise import CorrelatedNoise
 from .parameters.discrepancy import ModelError
 from .parameters.stack import ParameterStack
 from .policy import ACCURACY, POLICY
-from .posterior import Posterior
 from .residuals.term import ResidualTerm
 from .surface_distance import Correspondence, SurfaceDistance, expected_distance
-from .verdict import Check
 
 Floats = NDArray[np.float64]
 
@@ -273,23 +270,3 @@ class Problem(ParameterStack):
             slopes = self.inputs.stiffness_scaling(own)[1]
             whole[:, self.input_part] = self.inputs.net_forces(own) + net[:, None] * slopes
         return whole
-
-    # ------------------------------------------------------------------ what is said afterwards
-
-    def known(self, evaluation: Evaluation, posterior: Posterior) -> list[tuple[ParameterBlock, BlockPosterior]]:
-        """What is known of each block where a solver ended."""
-        has_forces, scales = self.forces.size > 0, posterior.scales
-        return [
-            (
-                block,
-                BlockPosterior(
-                    evaluation, evaluation.coefficients[part], posterior.covariance[part, part], scales, has_forces
-                ),
-            )
-            for block, part in self.parts
-        ]
-
-    def checks(self, evaluation: Evaluation, posterior: Posterior, expected: Expectations) -> list[Check]:
-        """What blocks and terms say of a result."""
-        by_blocks = [each for block, own in self.known(evaluation, posterior) for each in block.checks(own, expected)]
-        return by_blocks + [each for term in self.terms for each in term.checks(evaluation)]

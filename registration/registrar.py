@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from softtwin.reference.data.outcome import NotConverged
 
-from .checks import shared
 from .cloud import Cloud
 from .conclusion import conclude
 from .expectations import Expectations
@@ -31,11 +30,12 @@ from .residuals.term import ResidualTerm
 from .result import Registration, badness
 from .setup import Ended, Setup
 from .strategies.cold_start import finish, localise
+from .strategies.elsewhere import compared, is_missed
 from .strategies.refinement import refine
 from .strategies.tracking import has_left, track
 from .surface_distance import SurfaceDistance
 from .tracker import Tracker
-from .verdict import Check, Code, Verdict
+from .verdict import Verdict
 
 Floats = NDArray[np.float64]
 
@@ -117,8 +117,6 @@ class Registrar:
         """Noise, solver, thinning, search for the place of the forces."""
         return self.setup.options
 
-    # ------------------------------------------------------------------ the same, otherwise
-
     def with_pose(self, pose: PosePrior, options: RegistrationOptions) -> Registrar:
         """The same with an unknown pose, and the options that suit it."""
         anywhere, setup = self.anywhere, self.setup
@@ -161,8 +159,6 @@ class Registrar:
         """
         return self._with(replace(self.setup, terms=terms))
 
-    # ------------------------------------------------------------------ one cloud
-
     def register(self, cloud: ArrayLike, start: Registration | None = None) -> Registration:
         """The forces, the state and the pose that bring the observed side to a cloud.
 
@@ -184,8 +180,7 @@ class Registrar:
             last: the last usable result.
 
         Raises:
-            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
-            NotConverged: the model found no state there.
+            CloudError, NotConverged: as for `register`.
         """
         begin = time.perf_counter()
         return self._concluded(track(self.setup, self.setup.checked(cloud), last), begin)
@@ -233,8 +228,7 @@ class Registrar:
             last: this model's result for the frame before.
 
         Raises:
-            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
-            NotConverged: the model found no state there.
+            CloudError, NotConverged: as for `register`.
         """
         begin = time.perf_counter()
         ended = refine(self.setup, self.setup.checked(cloud), draft, fast, last)
@@ -246,11 +240,7 @@ class Registrar:
         Args:
             found: a result with forces in the zone alone.
         """
-        if self.anywhere is None or not found.judgement.is_usable:
-            return False
-        match = found.evaluation.match  # with those points that were taken for outliers: patches of them are none
-        part = shared(self.setup.observed.closest_points(match), match.distances, np.ones(len(match.distances)))
-        return match.rms * np.sqrt(part) > self.setup.noise.minimum
+        return self.anywhere is not None and found.judgement.is_usable and is_missed(self.setup, found)
 
     def asked(self, cloud: ArrayLike, found: Registration) -> Registration:
         """A result, doubtful where forces elsewhere explain what it leaves: a second registration where it is missed.
@@ -270,10 +260,8 @@ class Registrar:
             hurried = anywhere._with(anywhere.setup.with_solver(until=solver.until, before_step=solver.before_step))
             other = hurried.with_terms(*self.setup.terms).register(cloud)
             if other.judgement.is_usable:
-                return found.with_check(_elsewhere(found.evaluation.match.rms, other.evaluation.match.rms))
+                return found.with_check(compared(found, other))
         return found
-
-    # ------------------------------------------------------------------ which strategy
 
     def _registered(self, cloud: ArrayLike, start: Registration | None) -> Registration:
         begin, setup = time.perf_counter(), self.setup
@@ -380,27 +368,6 @@ def prepare(
         blocks=() if blocks is None else blocks(observed),
         modulus_deviation=modulus_deviation,
         anywhere=None if elsewhere is None or nodes is None else anywhere,
-    )
-
-
-def _elsewhere(within: float, anywhere: float) -> Check:
-    """Whether forces outside the zone explain a cloud better: root mean square distances with both, metres."""
-    ratio = anywhere / within
-    is_better = ratio < POLICY.elsewhere
-    reason = (
-        f"forces outside the zone explain the cloud better: points lie {1e3 * within:.2f} mm from the surface, with "
-        f"forces anywhere {1e3 * anywhere:.2f} mm"
-    )
-    verdict = Verdict.DOUBTFUL if is_better else Verdict.ACCEPTED
-    unit = "of the distances that are left"
-    return Check(
-        Code.FORCES_ELSEWHERE,
-        verdict,
-        ratio,
-        POLICY.elsewhere,
-        unit,
-        is_minimum=True,
-        reason=reason if is_better else "",
     )
 
 

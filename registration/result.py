@@ -78,8 +78,6 @@ class Registration:
         """The same of a cloud that was brought to the body by a pose which is exact."""
         return replace(self, moved=replace(self.moved, pose=pose))
 
-    # ------------------------------------------------------------------ how it has moved
-
     @property
     def state(self) -> State:
         """The body's state as the model has it; see `Moved`."""
@@ -129,8 +127,6 @@ class Registration:
     def net_force_deviation(self) -> Floats:
         """Standard deviation of each component of the net force, (3,), newtons."""
         return np.sqrt(np.diag(self.net_force_covariance))
-
-    # ------------------------------------------------------------------ where the solver ended
 
     @property
     def problem(self) -> Problem:
@@ -228,8 +224,8 @@ class Registration:
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:
         """What is known of stiffness and other unknowns beside the forces; none where there are none."""
-        known = self.problem.known(self.evaluation, self.posterior)
-        return tuple(each for block, own in known for each in block.estimates(own.mean, own.covariance))
+        found, covariance, parts = self.coefficients, self.posterior.covariance, self.problem.parts
+        return tuple(each for block, part in parts for each in block.estimates(found[part], covariance[part, part]))
 
     @cached_property
     def chance_of_pose(self) -> float:
