@@ -4,8 +4,8 @@
     python benchmarks/policy.py FOLDER [--cases 4] [--only shared_size ...]
 
 A panel of clouds is registered with the surrogate of the quickstart's organ: right and wrong ones of `verdict.py`
-without a zone, right ones with forces within 40 mm of where the organ has moved most, and frames that follow each
-other. It is registered again with one number halved, and doubled (of a chance its logarithm is; whole numbers are
+without a zone, right ones with forces within 40 mm of where the organ has moved most, others with noise that
+neighbours share, or seen from a pose that is unknown, and frames that follow each other. It is registered again with one number halved, and doubled (of a chance its logarithm is; whole numbers are
 rounded). Errors are compared cloud by cloud: the mean change of the right ones with its standard error, relative to the
 mean error. A number whose half and twice change no error by more than that, no coverage and no verdict is one of
 `ACCURACY`; answers depend on the others.
@@ -20,18 +20,22 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import misspecified
 import numpy as np
 from columns import Column
 from harness import FOLDER, Benchmark, Given, Setting, run
 from numpy.typing import NDArray
-from verdict import BEYOND, KINDS, states
+from robustness import noisy
+from verdict import BEYOND, KINDS, NOISE, changed, states, unit
 
 from softtwin.app.quickstart import CAMERA, POINTS
 from softtwin.app.twin import Twin
+from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError, partial_view
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.options import expected_force, options_for
 from softtwin.registration.policy import ACCURACY, POLICY, varied
+from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import prepare
 from softtwin.registration.result import Registration
 from softtwin.registration.tracker import Tracker
@@ -40,8 +44,20 @@ from softtwin.registration.verdict import Verdict
 Floats = NDArray[np.float64]
 FACTORS = {"half": 0.5, "twice": 2.0}
 ZONE, FRAMES, WITHIN = 0.04, 12, 0.9  # metres about the node that has moved most, frames, share
+SHARED, POSED = "noise that neighbours share", "pose unknown"
 IN_ZONE = ("noise 0.1 mm", "noise 1.0 mm", "noise 5.0 mm")
 ROWS = tuple(each.name for table in (POLICY, ACCURACY) for each in fields(table))
+
+
+def shared_noise(cloud: Floats, _body: Body, rng: np.random.Generator) -> Floats:
+    """A millimetre that neighbours within 20 mm share, and little of each point's own."""
+    return misspecified.noisy(cloud, "noise that neighbours share", rng)
+
+
+def posed(cloud: Floats, body: Body, rng: np.random.Generator) -> Floats:
+    """Seen from up to 2 degrees and 3 mm beside where the camera was expected."""
+    twist = np.concatenate([np.deg2rad(2.0) * unit(rng), 3e-3 * unit(rng)])
+    return Pose.identity().moved(rng.uniform() * twist, body.points.mean(axis=0)).apply(cloud)
 
 
 @cache
@@ -49,8 +65,9 @@ def clouds(folder: Path, count: int) -> list[tuple[str, Floats | None, Floats]]:
     """Name, displacement and cloud of each case."""
     with Twin.open(folder, "surrogate", pose="fixed") as twin:
         body = twin.body
-    found = []
-    for kind, names in KINDS.items():
+    found, kinds = [], {kind: dict(names) for kind, names in KINDS.items()}
+    kinds["right"] |= {SHARED: changed(shared_noise), POSED: changed(noisy(NOISE), posed)}
+    for kind, names in kinds.items():
         for name, made in names.items():
             rng = np.random.default_rng([5, *name.encode()])
             for state in states(folder, count):
@@ -79,7 +96,10 @@ def panel(folder: Path, count: int, name: str = "", factor: float = 1.0) -> dict
     found: dict[str, dict[str, Any]] = {}
     with varied(name, factor) if name else nullcontext(), Twin.open(folder, "surrogate", pose="fixed") as twin:
         for number, (kind, truth, cloud) in enumerate(clouds(folder, count)):
-            found[f"{kind}, {number}"] = timed(lambda cloud=cloud: twin.register(cloud, ""), truth)
+            camera = twin.near(Pose.identity()) if kind.endswith(POSED) else None
+            found[f"{kind}, {number}"] = timed(
+                lambda cloud=cloud, camera=camera: twin.register(cloud, "", camera=camera), truth
+            )
             if truth is not None and kind.removeprefix("right: ") in IN_ZONE:
                 found[f"{kind}, {number}, zone"] = timed(
                     lambda cloud=cloud, truth=truth: in_zone(twin, truth, cloud), truth
