@@ -5,10 +5,11 @@
 
 A panel of clouds is registered with the surrogate of the quickstart's organ: right and wrong ones of `verdict.py`
 without a zone, right ones with forces within 40 mm of where the organ has moved most, others with noise that
-neighbours share, or seen from a pose that is unknown, and frames that follow each other. It is registered again with one number halved, and doubled (of a chance its logarithm is; whole numbers are
-rounded). Errors are compared cloud by cloud: the mean change of the right ones with its standard error, relative to the
-mean error. A number whose half and twice change no error by more than that, no coverage and no verdict is one of
-`ACCURACY`; answers depend on the others.
+neighbours share, or seen from a pose that is unknown, and frames that follow each other. It is registered again with
+one number halved, and doubled (of a chance its logarithm is; whole numbers are rounded). Errors are compared cloud by
+cloud: the mean change of the right ones with its standard error, relative to the mean error. A number whose half and
+twice change no error by more than that, no coverage and no verdict is one of `ACCURACY`; answers depend on the
+others.
 """
 
 from __future__ import annotations
