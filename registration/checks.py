@@ -77,8 +77,8 @@ def _cloud(problem: Problem, found: SolverResult, expected: Expectations) -> Ite
     narrow = "the cloud is a line or a spot: it shows no surface"
     yield checked(Code.CLOUD_SHAPE, width, POLICY.line, narrow, is_minimum=True, refused=POLICY.line)
     if problem.forces.size:
-        informed = found.posterior.informed_forces
-        nothing = f"the cloud tells {informed:.1f} directions of force: hardly anything"
+        informed = found.posterior.informed
+        nothing = f"the cloud tells {informed:.1f} directions of what is unknown: hardly anything"
         yield checked(Code.INFORMATION, informed, expected.informed, nothing, unit="directions", is_minimum=True)
 
 

@@ -19,10 +19,10 @@ def posterior(local: LocalModel) -> Posterior:
         local: the objective's model there.
     """
     shares = np.einsum("ij,ji->i", local.inverse, local.informed)
-    informed, of_force = (float(shares[part].sum()) for part in (local.problem.moving, local.problem.force_part))
+    informed = float(shares[local.problem.moving].sum())
     moved, spread = _by_hyperparameters(local)
     covariance = error_covariance(local) + moved @ spread @ moved.T
-    return Posterior(local.evaluation.coefficients, covariance, local.scales, informed, of_force)
+    return Posterior(local.evaluation.coefficients, covariance, local.scales, informed)
 
 
 def error_covariance(local: LocalModel) -> Floats:

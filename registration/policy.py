@@ -189,7 +189,9 @@ class Policy:
         3.0, "times what was expected", "largest median lean of measured normals", "normals of turned frames"
     )
     minimum_points: float = choice(30, "points", "fewest of a cloud", "verdict: few points")
-    minimum_directions: float = choice(2.0, "directions", "fewest of force that a cloud tells", "verdict: few points")
+    minimum_directions: float = choice(
+        2.0, "directions", "fewest of what is unknown that a cloud tells", "verdict: few points"
+    )
     line: float = choice(0.02, "of its length", "width of a cloud that is taken for a line", "geometry")
     thin: float = choice(0.05, "of the spread", "thickness of points that form a surface: 0.1 of a space", "outliers")
     linear: float = choice(

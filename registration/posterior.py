@@ -21,14 +21,12 @@ class Posterior:
         covariance: (k, k).
         scales: noise and force scale that it was taken with.
         informed: directions that the cloud tells more of than the prior did (the sum of their shares).
-        informed_forces: of these, directions of force.
     """
 
     mean: Floats
     covariance: Floats
     scales: Hyperparameters
     informed: float
-    informed_forces: float
 
     def net_force_covariance(self, net: Floats, left_out: Floats) -> Floats:
         """Covariance of the net force, (3, 3), newtons^2, with the prior's share of what was left out.
