@@ -430,9 +430,10 @@ class Twin:
         """
         zone = self.config.registration.zone if zone is None else zone
         if camera is not None:
-            if self._posed is None or self._posed[0] != zone or self._posed[1] is not camera:
-                self._posed = zone, camera, self._prepared(zone, camera)
-            return self._posed[2]
+            posed = self._posed  # once: a search beside the frames may put another there
+            if posed is None or posed[0] != zone or posed[1] is not camera:
+                self._posed = posed = zone, camera, self._prepared(zone, camera)
+            return posed[2]
         if zone not in self._registrars:
             self._registrars[zone] = self._prepared(zone, None)
         return self._registrars[zone]

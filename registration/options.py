@@ -42,10 +42,10 @@ class SparseLocalisation:
         points: so many of the cloud are enough, but for the last round.
     """
 
-    rounds: int = field(default_factory=lambda: ACCURACY.rounds)
+    rounds: int = field(default_factory=lambda: POLICY.rounds)
     reach: float = field(default_factory=lambda: POLICY.force_reach)
     informed: LikelihoodInformed = field(default_factory=LikelihoodInformed)
-    points: int = field(default_factory=lambda: ACCURACY.few_points)
+    points: int = field(default_factory=lambda: POLICY.few_points)
 
     def __post_init__(self) -> None:
         if self.points < 1:
@@ -117,7 +117,7 @@ def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> 
     """
     clear, loud = POLICY.force_scale_free_below * POLICY.noise_minimum, POLICY.force_scale_free_above * model.error
     if model.error == 0.0:
-        localisation = SparseLocalisation(rounds=0 if has_zone else ACCURACY.rounds, points=_MANY)
+        localisation = SparseLocalisation(rounds=0 if has_zone else POLICY.rounds, points=_MANY)
         return RegistrationOptions(localisation=localisation, hyperprior=ForceHyperprior(clear))
     if has_zone:
         hyperprior = ForceHyperprior(clear if has_pose else 0.0, loud)

@@ -153,6 +153,9 @@ class Policy:
         "the same of a model that errs: with more, the forces' doubt is larger than their error",
         "robustness, surrogate: no zone",
     )
+    surface_modes: int = count(48, "", "modes of the observed side for each component of shared noise", "policy")
+    few_points: int = count(300, "", "points of a cloud that look for the place of the forces", "policy")
+    rounds: int = count(2, "", "rounds of gathering forces", "policy")
 
     # From where on a result is doubtful; refused, where that is possible, beyond `refused` times the level.
     unlikely: float = choice(
@@ -242,13 +245,10 @@ class Accuracy:
     groups: int = count(6, "", "groups of points by how far the model's error makes them doubtful")
     lengths: int = count(5, "", "lengths of shared noise that are looked at")
     sizes: int = count(40, "", "sizes of it")
-    surface_modes: int = count(48, "", "modes of the observed side for each component of it")
     first_modes: int = count(20, "", "of these are asked first")
     hoped: float = choice(0.25, "of what is believed against it", "these have to promise to go on")
     carried: float = choice(0.9, "of its variance", "what modes carry of a model's error beside its patterns")
     points: int = count(1000, "", "larger clouds are thinned to so many points")
-    few_points: int = count(300, "", "of these look for the place of the forces")
-    rounds: int = count(2, "", "rounds of gathering forces")
     leading: int = count(6, "", "directions of force that a cold start begins with")
     expansion_points: int = count(3, "", "exact states from which a fast model goes on")
     far: float = choice(
