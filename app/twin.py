@@ -443,7 +443,7 @@ class Twin:
 
         def posed(plain: Registrar) -> Registrar:
             assert camera is not None
-            options = _options(section, options_for(plain.model, bool(zone), has_pose=True))
+            options = _options(section, options_for(plain.model, bool(zone)))
             return plain.with_pose(camera, options)
 
         if camera is not None:

@@ -146,7 +146,7 @@ def registrar_for(
         zone,
         model.body.surfaces["observed"],
         force_scale=expected_force(model.body, YOUNG_MODULUS),
-        options=options_for(model, zoned, pose is not None),
+        options=options_for(model, zoned),
         pose=pose,
     )
 

@@ -26,7 +26,7 @@ from .outcome import Outcome
 from .parameters.block import BlockPosterior
 from .policy import ACCURACY, POLICY
 from .problem import Problem
-from .score import Score, by_rigid_motion, by_scale, score
+from .score import Score, by_rigid_motion, by_scale, scores
 from .verdict import Check, Code, Judgement, Verdict, checked
 
 Floats = NDArray[np.float64]
@@ -198,20 +198,17 @@ def _blocks(problem: Problem, found: SolverResult, expected: Expectations) -> It
 
 def _left_out(problem: Problem, found: SolverResult) -> Iterator[Check]:
     """What is no unknown here, and would explain the cloud better: its scale, and a pose that was given as exact."""
-    told = score(found.local, by_scale(found.local))
-    if told is not None:
-        yield _scored(Code.SCALE, told, False, "")  # see `score.by_scale`: shown, and decides nothing
-    if problem.pose is not None:
-        return
-    told = score(found.local, by_rigid_motion(found.local))
-    if told is not None:
-        turn, shift = (float(np.linalg.norm(part)) for part in np.split(told.estimate, 2))
+    of_scale, of_pose = scores(found.local, by_scale(found.local), by_rigid_motion(found.local))
+    if of_scale is not None:
+        yield _scored(Code.SCALE, of_scale, False, "")  # see `score.by_scale`: shown, and decides nothing
+    if problem.pose is None and of_pose is not None:
+        turn, shift = (float(np.linalg.norm(part)) for part in np.split(of_pose.estimate, 2))
         matters = max(turn * problem.observed.body.size / 2.0, shift) > problem.noise.median
         odd = (
             f"the cloud fits better turned by {np.rad2deg(turn):.1f} degrees and shifted by {1e3 * shift:.1f} mm: the "
             "pose is not exact; say --pose unknown"
         )
-        yield _scored(Code.EXACT_POSE, told, matters, odd)
+        yield _scored(Code.EXACT_POSE, of_pose, matters, odd)
 
 
 def _scored(code: Code, told: Score, matters: bool, reason: str) -> Check:

@@ -24,6 +24,8 @@ from .problem import Problem
 from .score import gain_by_shared_noise
 
 Floats = NDArray[np.float64]
+_USUAL = 0.5  # of the last step's length: the next one's, where that step says nothing of it
+_SLOWEST = 0.75  # the most that is believed of it: closest points jump, and steps do not shrink for ever
 
 
 @dataclass(frozen=True)
@@ -102,10 +104,10 @@ class GaussNewton:
     Args:
         losses: one after the other.
         max_iterations: of all losses together; what neighbours share is sought in as many more.
-        settled: a step shorter than this, in posterior deviations a coefficient, is the last: it has converged.
+        settled: it has converged where less than this will be left after one more step, in posterior deviations a
+            coefficient, by how much shorter steps become.
         enough: where no step lowers the objective further, or iterations run out, a step shorter than this counts as
-            settled: closest points jump from triangle to triangle, and no objective falls for ever. With 0.3 the
-            errors are 4 % larger than at the minimum.
+            settled: closest points jump from triangle to triangle, and no objective falls for ever.
         handed_on: the same for all losses but the last.
         graduation: the noise is taken as at least this part of what the linear model promises to change.
         max_step: first limit on the movement of any observed node in one step, part of the body's size.
@@ -140,7 +142,7 @@ class GaussNewton:
 
     def rough(self) -> GaussNewton:
         """The same with the first loss alone, ended early: for a start."""
-        few = min(self.max_iterations, ACCURACY.rough_iterations)
+        few = min(self.max_iterations, ACCURACY.few_iterations)
         return replace(self, losses=self.losses[:1], settled=self.handed_on, max_iterations=few)
 
     def unsettled(self) -> GaussNewton:
@@ -212,7 +214,7 @@ class _Search:
         if self.problem is self.whole:
             outcome = self._descend(last, options.settled)
         else:  # points far off are told first, then what neighbours share
-            outcome = self._descend(last, options.settled, ACCURACY.unshared_iterations)
+            outcome = self._descend(last, options.settled, ACCURACY.few_iterations)
             self.begun, is_whole = len(self.trace), self._takes_whole(last)
             if not is_whole and outcome is not Outcome.CONVERGED:
                 outcome = self._descend(last, options.settled)
@@ -232,7 +234,7 @@ class _Search:
     def _takes_whole(self, loss: Loss) -> bool:
         """Goes on with noise that neighbours share, where that may make the cloud more likely and does."""
         gain, size, length = gain_by_shared_noise(self._local(loss), self.whole)
-        if gain <= 0.0:
+        if not np.isfinite(gain):
             return False
         before = self.problem, self._at, self.evaluation, self.noise, self.own, self.eta
         self.problem, self._at = self.whole, None
@@ -282,12 +284,15 @@ class _Search:
         is_handed_on, is_exact = settled >= self.options.handed_on, False
         while len(self.trace) < most:
             local = self._local(loss)
-            if local.is_carried and (local.length >= settled or local.is_graduated):
+            if local.is_carried and (self._left(local.length) >= settled or local.is_graduated):
                 local = self._renewed(loss)
-            if local.length < settled and not local.is_graduated:
+            if self._left(local.length) < settled and not local.is_graduated:
                 if is_handed_on or is_exact:
                     return Outcome.CONVERGED
-                if self._is_closest(local, settled) and self._local(loss).length < self.options.enough:
+                if (
+                    self._left(self._closest_length(local)) < settled
+                    and self._left(self._local(loss).length) < self.options.enough
+                ):
                     return Outcome.CONVERGED
                 is_exact = True
                 continue
@@ -319,15 +324,29 @@ class _Search:
 
     def _has_enough(self) -> bool:
         local, enough = self._local(self.options.losses[-1]), self.options.enough
-        return local.length < enough and not local.is_graduated and self._is_closest(local, enough)
+        return local.length < enough and not local.is_graduated and self._closest_length(local) < enough
 
-    def _is_closest(self, local: LocalModel, settled: float) -> bool:
-        """Search the closest points anew; True where that moves the minimum no further than the search goes."""
+    def _left(self, length: float) -> float:
+        """How long the steps after the next will be in all, where each is shorter than the last by the same factor.
+
+        What simplified Newton iterations are stopped by (Hairer and Wanner 1996, IV.8).
+
+        Args:
+            length: of the next.
+        """
+        before = self.trace[-1] if self.trace else None
+        rate = _USUAL
+        if before is not None and abs(before.gain - 1.0) < ACCURACY.kept:  # else what it promised was wrong
+            rate = min(length / before.length, _SLOWEST)
+        return length * rate / (1.0 - rate)
+
+    def _closest_length(self, local: LocalModel) -> float:
+        """Search the closest points anew; the next step's length with them."""
         before = self.evaluation.match.distances
         again = self.problem.again(self.evaluation, self.options.trusted * robust_deviation(before))
         if np.abs(again.match.distances - before).max() >= ACCURACY.unchanged * self.noise:
             self.evaluation = again
-        return local.length_for(again) < settled
+        return local.length_for(again)
 
     def _lies_closer(self, local: LocalModel, loss: Loss) -> bool:
         """Search the closest points anew where no step helps; True where a point that had walked astray lies closer."""

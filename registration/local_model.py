@@ -141,6 +141,30 @@ class LocalModel:
         return float(np.sqrt(max(square, 0.0) / max(linear.count.sum(), 1.0)))
 
     @cached_property
+    def whitened(self) -> Floats:
+        """The derivatives over the points' deviations, as they were counted, (p, k)."""
+        return self._root[:, None] * self.jacobian
+
+    @property
+    def _root(self) -> Floats:
+        return np.sqrt(self.counted) / self.deviations
+
+    def told_of(self, columns: Floats) -> tuple[Floats, Floats]:
+        """Slope of the logarithm of the likelihood by parameters that are none here, (m,), and its covariance, (m, m).
+
+        All unknowns are integrated out with what is believed of them.
+
+        Args:
+            columns: derivative of the distances by these parameters, (p, m).
+        """
+        weighted, residuals = self._root[:, None] * columns, self.problem.residuals(self.evaluation, self.own)
+        across = self.whitened.T @ weighted
+        solved = self.solved(across)
+        # What the last step, which was not taken, would still change of the residuals counts, too.
+        pull = solved.T @ self.gradient - (self.weights * residuals / self.deviations**2) @ columns
+        return pull, weighted.T @ weighted - across.T @ solved
+
+    @cached_property
     def _scaled_hessian(self) -> Floats:
         """In coefficients of unit prior variance: forces in newtons and poses differ by orders of size."""
         root = 1.0 / np.sqrt(self.precision)

@@ -58,12 +58,10 @@ class ForceHyperprior:
 
     Args:
         clear: in clouds of less noise, metres.
-        loud: and in clouds of more, beside which what the model gets wrong is small, metres.
         spread: of the logarithm of the size then.
     """
 
     clear: float = 0.0
-    loud: float = np.inf
     spread: float = field(default_factory=lambda: POLICY.force_spread_free)
 
 
@@ -102,30 +100,24 @@ class RegistrationOptions:
             raise ValueError(f"RegistrationOptions.maximum_points: expected at least 1, got {self.maximum_points}.")
 
 
-def options_for(model: ForwardModel, has_zone: bool, has_pose: bool = False) -> RegistrationOptions:
+def options_for(model: ForwardModel, has_zone: bool) -> RegistrationOptions:
     """Options that suit a model.
 
     Within a zone forces are not gathered: what a cloud was used to believe it would be used to find once more, and
-    margins would be too narrow. An exact model is only as good as the end of the descent. What a surrogate gets wrong
-    could be taken for large forces: it is left to clouds of more noise than that to tell their size. But where the
-    pose is unknown, forces that are expected small would be taken for a turn of the organ, which is worse.
+    margins would be too narrow. An exact model is only as good as the end of the descent, and leaves it to clear
+    clouds to tell the size of the forces; what a surrogate gets wrong could be taken for large ones.
 
     Args:
         model: forward model.
         has_zone: the nodes that may carry force are those that a tool can touch.
-        has_pose: the pose is unknown.
     """
-    clear, loud = POLICY.force_scale_free_below * POLICY.noise_minimum, POLICY.force_scale_free_above * model.error
     if model.error == 0.0:
+        clear = POLICY.force_scale_free_below * POLICY.noise_minimum
         localisation = SparseLocalisation(rounds=0 if has_zone else POLICY.rounds, points=_MANY)
         return RegistrationOptions(localisation=localisation, hyperprior=ForceHyperprior(clear))
     if has_zone:
-        hyperprior = ForceHyperprior(clear if has_pose else 0.0, loud)
-        return RegistrationOptions(localisation=SparseLocalisation(rounds=0, points=_MANY), hyperprior=hyperprior)
-    return RegistrationOptions(
-        localisation=SparseLocalisation(reach=POLICY.force_reach_surrogate),
-        hyperprior=ForceHyperprior(loud=loud, spread=POLICY.force_spread_anywhere),
-    )
+        return RegistrationOptions(localisation=SparseLocalisation(rounds=0, points=_MANY))
+    return RegistrationOptions(localisation=SparseLocalisation(reach=POLICY.force_reach_surrogate))
 
 
 def expected_force(body: Body, young_modulus: float) -> float:

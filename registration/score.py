@@ -43,31 +43,28 @@ class Score:
         return float(chdtrc(len(self.estimate), self.statistic))
 
 
-def score(local: LocalModel, columns: Floats) -> Score | None:
-    """The test at the end of a registration; None where the cloud tells nothing of the parameters.
+def scores(local: LocalModel, *columns: Floats) -> list[Score | None]:
+    """The test at the end, of each of several sets of parameters; None of which the cloud tells nothing.
 
     Args:
         local: the objective's model there.
-        columns: derivative of the distances by the parameters, (p, m).
+        columns: derivatives of the distances by the parameters of each set, (p, m).
     """
-    pull, information = _pull(local, columns)
+    every = np.hstack(columns)
+    pull, information = local.told_of(every)
+    scales = np.square(every / local.deviations[:, None]).sum(axis=0)
+    ends = np.cumsum([each.shape[1] for each in columns])
+    parts = [slice(end - each.shape[1], end) for end, each in zip(ends, columns, strict=True)]
+    lost = np.finfo(float).eps * len(every)
+    return [_score(pull[part], information[part, part], lost * float(scales[part].max(initial=0.0))) for part in parts]
+
+
+def _score(pull: Floats, information: Floats, least: float) -> Score | None:
     values, vectors = np.linalg.eigh(information)
-    scale = float(np.square(columns / local.deviations[:, None]).sum(axis=0).max(initial=0.0))
-    if not len(values) or not values[0] > np.finfo(float).eps * len(columns) * scale:
+    if not len(values) or not values[0] > least:
         return None
     estimate = vectors @ ((vectors.T @ pull) / values)
     return Score(estimate, float(pull @ estimate))
-
-
-def _pull(local: LocalModel, columns: Floats) -> tuple[Floats, Floats]:
-    """Slope of the logarithm of the likelihood by parameters at zero, (m,), and its expected covariance, (m, m)."""
-    root = np.sqrt(local.counted) / local.deviations
-    weighted, residuals = root[:, None] * columns, local.problem.residuals(local.evaluation, local.own)
-    across = (root[:, None] * local.jacobian).T @ weighted
-    solved = local.solved(across)
-    # What the last step, which was not taken, would still change of the residuals counts, too.
-    pull = solved.T @ local.gradient - (local.weights * residuals / local.deviations**2) @ columns
-    return pull, weighted.T @ weighted - across.T @ solved
 
 
 def gain_by_shared_noise(local: LocalModel, problem: Problem) -> tuple[float, float, float]:
@@ -85,16 +82,17 @@ def gain_by_shared_noise(local: LocalModel, problem: Problem) -> tuple[float, fl
 
     Returns:
         The most of it, and the logarithms of size and length where that is, metres; minus infinity where none promises
-        anything.
+        anything worth looking for.
     """
     best = (-np.inf, 0.0, 0.0)
     if problem.shared is None:
         return best
     few = _SharedNoise(local, problem.with_shared(problem.shared.leading(ACCURACY.first_modes)))
-    if all(few.promised(length) < ACCURACY.hoped for length in few.lengths):
+    if all(few.promised(length) < ACCURACY.worth for length in few.lengths):
         return best
     every = _SharedNoise(local, problem)
-    return max([best, *(every.best(length) for length in every.lengths if every.promised(length) >= 1.0)])
+    found = max(best, *(every.best(length) for length in every.lengths))
+    return found if found[0] >= ACCURACY.worth else best
 
 
 class _SharedNoise:
@@ -108,13 +106,14 @@ class _SharedNoise:
     def __init__(self, local: LocalModel, problem: Problem) -> None:
         assert problem.shared is not None
         self._modes, hyperprior = problem.shared.modes, problem.hyperprior
-        pull, self._covariance = _pull(local, problem.shared.by_points(local.evaluation))
+        pull, self._covariance = local.told_of(problem.shared.by_points(local.evaluation))
         weights, scaled = local.weights, local.problem.residuals(local.evaluation, local.own) / local.deviations
         shrunk = float(np.sum((weights * scaled) ** 2) / max(weights.sum(), 1e-300))
         self._pull = pull / np.sqrt(max(shrunk, 1e-300))
         median, high = float(hyperprior.median[SHARED]), float(hyperprior.highest[SHARED])
         self._sizes = np.linspace(max(float(hyperprior.lowest[SHARED]), median), high, ACCURACY.sizes)
         self._costs = 0.5 * ((self._sizes - median) / hyperprior.spread[SHARED]) ** 2
+        self._hyperprior = hyperprior
         self.lengths: list[float] = np.linspace(
             hyperprior.lowest[LENGTH], hyperprior.highest[LENGTH], ACCURACY.lengths
         ).tolist()
@@ -125,13 +124,10 @@ class _SharedNoise:
         return root * self._pull, root[:, None] * self._covariance * root
 
     def promised(self, length: float) -> float:
-        """Top of the parabola over what is believed against it there; 0 where it falls."""
+        """Top of the parabola for the logarithm of a length; 0 where it falls."""
         slopes, matrix = self._scaled(length)
         slope, bend = 0.5 * float(slopes @ slopes - np.trace(matrix)), 0.5 * float(np.sum(matrix**2))
-        if slope <= 0.0:
-            return 0.0
-        cost = float(np.interp(0.5 * np.log(slope / bend), self._sizes, self._costs))
-        return 0.5 * slope**2 / bend / cost if cost > 0.0 else np.inf
+        return 0.5 * slope**2 / bend if slope > 0.0 else 0.0
 
     def best(self, length: float) -> tuple[float, float, float]:
         """The most of the gain for the logarithm of a length, and the logarithms of size and length, metres."""
@@ -139,7 +135,8 @@ class _SharedNoise:
         values, vectors = np.linalg.eigh(matrix)
         grown = np.exp(2.0 * self._sizes)[:, None] * np.maximum(values, 0.0)
         squares = np.exp(2.0 * self._sizes)[:, None] * (vectors.T @ slopes) ** 2
-        gains = 0.5 * (squares / (1.0 + grown) - np.log1p(grown)).sum(axis=1) - self._costs
+        off = (length - self._hyperprior.median[LENGTH]) / self._hyperprior.spread[LENGTH]
+        gains = 0.5 * (squares / (1.0 + grown) - np.log1p(grown)).sum(axis=1) - self._costs - 0.5 * off**2
         top = int(gains.argmax())
         return float(gains[top]), float(self._sizes[top]), length
 

@@ -15,7 +15,7 @@ from softtwin.meshes.closest import ClosestPoints, closest_in_triangles
 from softtwin.meshes.curvature import mean_curvature
 from softtwin.meshes.embedding import outer
 
-from .policy import POLICY
+from .policy import ACCURACY
 from .surface_modes import SurfaceModes, surface_modes
 
 Floats = NDArray[np.float64]
@@ -94,7 +94,7 @@ class SurfaceDistance:
     @cached_property
     def modes(self) -> SurfaceModes:
         """The smoothest functions on the observed side at rest."""
-        return surface_modes(self.rest, self.triangles, POLICY.surface_modes)
+        return surface_modes(self.rest, self.triangles, ACCURACY.surface_modes)
 
     def match(self, displacement: Floats, cloud: Floats, near: Correspondence | None = None) -> Correspondence:
         """A cloud (p, 3) matched to the surface moved by the displacement (m, 3) of the nodes `nodes`, metres.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..evaluation import Evaluation, Slopes
 from ..hyperparameters import LENGTH, SHARED, LogNormalPrior
-from ..policy import POLICY
+from ..policy import ACCURACY, POLICY
 from ..surface_distance import SurfaceDistance
 from ..surface_modes import SurfaceModes
 from .block import ParameterBlock
@@ -43,7 +43,7 @@ class CorrelatedNoise(ParameterBlock):
 
     def hyperpriors(self, observed: SurfaceDistance) -> Mapping[int, LogNormalPrior]:
         """Of its size and its length."""
-        least = POLICY.shared_length_minimum * observed.edge
+        least = ACCURACY.shared_length_minimum * observed.edge
         median = max(POLICY.shared_length * np.sqrt(self.modes.area), least)
         longest = POLICY.shared_length_maximum * median
         return {

@@ -64,8 +64,7 @@ class ModelError(FieldBlock):
                 1.0,
                 POLICY.discrepancy_spread,
                 POLICY.discrepancy_minimum,
-                POLICY.discrepancy_maximum,
-                POLICY.discrepancy_spread_below,
+                spread_below=POLICY.discrepancy_spread_below,
             )
         }
 

@@ -18,7 +18,7 @@ from ..evaluation import Evaluation, Slopes
 from ..forward import ReducedModel
 from ..hyperparameters import FORCE as SCALE
 from ..hyperparameters import LogNormalPrior
-from ..policy import POLICY
+from ..policy import ACCURACY
 from ..surface_distance import SurfaceDistance
 from .block import ParameterBlock
 
@@ -261,7 +261,7 @@ def reweighting(
         reach: forces within this distance count together, metres.
         minimum: no part is smaller: a force elsewhere stays possible; that of the policy if not given.
     """
-    least = POLICY.force_elsewhere if minimum is None else minimum
+    least = ACCURACY.force_elsewhere if minimum is None else minimum
     place = positions[forces.nodes]
     size = np.linalg.norm(nodal[forces.nodes], axis=1)
     near = cKDTree(place).sparse_distance_matrix(cKDTree(place), 3.0 * reach, output_type="coo_matrix")

@@ -97,9 +97,8 @@ def _from(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResult, st
 
 def _believed(setup: Setup, prepared: Prepared, found: SolverResult) -> Prepared:
     """The forces' size as the cloud tells it, where it can: what was expected would call a sharp pull outliers."""
-    hyperprior, noise = setup.options.hyperprior, found.local.noise
-    is_told = noise < hyperprior.clear or noise > hyperprior.loud
-    if not is_told or prepared.forces.scale.spread >= hyperprior.spread:
+    hyperprior = setup.options.hyperprior
+    if found.local.noise >= hyperprior.clear or prepared.forces.scale.spread >= hyperprior.spread:
         return prepared
     return prepared.with_prior(hyperprior.spread)
 

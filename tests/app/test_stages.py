@@ -299,9 +299,9 @@ def test_one_block_too_many_is_refused(capsys, copy: Path) -> None:
     ("case", "message"),
     [
         ("changed plan", "seed (0 there, 3 here)"),
-        ("no body", "softtwin mesh"),
-        ("no configuration", "is no TOML"),
-        # Like the others, these end on rank 0 before the work is shared.
+        # Like the first, these end on rank 0 before the work is shared.
+        pytest.param("no body", "softtwin mesh", marks=pytest.mark.slow),
+        pytest.param("no configuration", "is no TOML", marks=pytest.mark.slow),
         pytest.param("zone inside the fixed set", "is on the free boundary", marks=pytest.mark.slow),
         pytest.param("all of the boundary fixed", "expected free nodes on the boundary", marks=pytest.mark.slow),
         pytest.param("wrong entry", "samples.load_path: expected a divisor", marks=pytest.mark.slow),

@@ -71,6 +71,7 @@ def test_a_guess_is_followed_to_its_neighbour_without_elimination() -> None:
 
 
 @pytest.mark.liver
+@pytest.mark.slow
 def test_where_a_rough_load_has_several_states_careful_steps_find_the_same(liver_folder) -> None:
     """Without a limit on eliminations the whole load ends on another stable branch."""
     from liver import POISSON_RATIO, YOUNG_MODULUS, liver, sequence

@@ -113,30 +113,16 @@ def test_more_than_the_model_was_seen_to_get_wrong_is_doubtful(body: Body, rng, 
     assert any("seen to get wrong" in each for each in result.judgement.reasons) == (verdict is Verdict.DOUBTFUL)
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-3])
-def test_a_clear_cloud_of_an_unknown_pose_tells_the_size_of_forces(body: Body, rng, noise: float) -> None:
-    """Expected small, they would be taken for a turn; it shows only when the model's error is told from noise."""
+def test_a_pull_of_an_unexpected_size_is_taken_for_no_turn(body: Body, rng) -> None:
+    """Of an unknown pose, ten times as large as forces were expected: margins hold where the organ is seen."""
     model, plain = Biased(body), registrar(body)
-    options = options_for(model, has_zone=True, has_pose=True)
-    pose = PosePrior(Pose.identity(), body.points.mean(axis=0))
-    cloud = cloud_on(body, true_displacement(body, np.array([0.5, -0.5])), 400, rng, noise)
-    spreads = []
-    for made in (Registrar(model, plain.observed, plain.forces, options, pose=pose), plain):
-        result = made.register(cloud)
-        assert result.judgement.is_usable
-        spreads.append(result.prepared.forces.scale.spread)
-    assert spreads[1] == plain.forces.scale.spread
-    assert (spreads[0] > spreads[1]) == (noise == 0.0)
-
-
-@pytest.mark.parametrize("noise", [1e-3, 2e-2])
-def test_noise_beside_which_the_models_error_is_small_tells_the_size_of_forces(body: Body, rng, noise: float) -> None:
-    """Less noise than the model's error does not: the error would be taken for forces."""
-    model, plain = Biased(body), registrar(body)
-    made = Registrar(model, plain.observed, plain.forces, options_for(model, has_zone=True))
-    result = made.register(cloud_on(body, true_displacement(body, np.array([0.5, -0.5])), 400, rng, noise))
+    small = replace(plain.forces, scale=replace(plain.forces.scale, median=0.1 * plain.forces.scale.median))
+    options, pose = options_for(model, has_zone=True), PosePrior(Pose.identity(), body.points.mean(axis=0))
+    truth = true_displacement(body, np.array([0.5, -0.5]))
+    result = Registrar(model, plain.observed, small, options, pose=pose).register(cloud_on(body, truth, 400, rng, 5e-4))
     assert result.judgement.is_usable
-    assert (result.prepared.forces.scale.spread > plain.forces.scale.spread) == (noise > model.error)
+    missed = np.linalg.norm(result.pose.apply(body.points + result.displacement) - body.points - truth, axis=1)
+    assert np.mean(missed <= result.camera_uncertainty.margin() + 1e-12) > 0.9
 
 
 def test_the_next_frame_starts_from_the_error_found(body: Body, rng) -> None:

@@ -107,7 +107,7 @@ def problem(body: Body, rng: np.random.Generator, **given: Any) -> Problem:
 
 def settled(given: Problem) -> LocalModel:
     """About the minimum of squares."""
-    return GaussNewton((Square(),), settled=1e-5, enough=1e-4).solve(given, np.zeros(given.size)).local
+    return GaussNewton((Square(),), settled=1e-5).solve(given, np.zeros(given.size)).local
 
 
 def test_a_scale_that_is_known_stays(body: Body, rng: np.random.Generator) -> None:

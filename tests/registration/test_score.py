@@ -17,7 +17,7 @@ from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
 from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import Registrar
-from softtwin.registration.score import by_rigid_motion, by_scale, gain_by_shared_noise, score
+from softtwin.registration.score import by_rigid_motion, by_scale, gain_by_shared_noise, scores
 from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.verdict import Code, Verdict
 
@@ -51,7 +51,7 @@ def test_of_a_right_model_chances_are_no_smaller_than_they_say(registrar: Regist
         found = registrar.register(some_cloud(registrar, seed))
         doubted += found.judgement.verdict is not Verdict.ACCEPTED
         for name, columns in (("scale", by_scale), ("motion", by_rigid_motion)):
-            told = score(found.local, columns(found.local))
+            told = scores(found.local, columns(found.local))[0]
             assert told is not None
             tested[name].append(told.p_value)
     assert doubted <= 3
@@ -106,7 +106,7 @@ def test_columns_are_derivatives_of_the_distances(registrar: Registrar) -> None:
 
 def test_nothing_is_said_of_what_is_not_seen(registrar: Registrar) -> None:
     local = registrar.register(some_cloud(registrar, 3)).local
-    assert local is not None and score(local, np.zeros((400, 1))) is None
+    assert local is not None and scores(local, np.zeros((400, 1))) == [None]
 
 
 def evidence_with(local: LocalModel, problem: Problem, size: float, length: float) -> float:

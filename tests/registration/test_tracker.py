@@ -143,6 +143,7 @@ def test_no_answer_waits_for_a_search(live: Tracker, lost: Any) -> None:
     assert answer.name == "meanwhile" and live.phase is Phase.SEARCHING  # type: ignore[attr-defined]
     assert answer.judgement.verdict is Verdict.DOUBTFUL and "searched for" in answer.judgement.reasons[-1]
     assert [way for way, _ in ways.taken] == ["track", "track"]  # the search waits, and no other was begun
+    ways.go.set()
 
 
 def test_what_a_search_found_better_is_gone_on_from(live: Tracker) -> None:
