@@ -2,6 +2,9 @@
 
     python benchmarks/dashboard.py          writes the tables into docs/results/*.md, between their marks
 
+So is the page of the numbers that registration has chosen, docs/method/choices.md, from `registration/policy.py` and
+the record of `policy.py`.
+
 A row names its record and the way to the figure in it, so that no figure is typed by hand; what others reached and what
 was asked for are typed once, in dashboard.toml, with their source. `tests/test_results.py` holds the pages to it.
 """
@@ -13,13 +16,16 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
+from softtwin.registration.policy import ACCURACY, POLICY
+
 RESULTS = Path(__file__).parent / "results"
 PAGES = Path(__file__).parents[1] / "docs" / "results"
+CHOICES = PAGES.parent / "method" / "choices.md"
 _SHORT = {"AMD EPYC": "EPYC", "Intel(R) Xeon(R) Processor": "Xeon"}
 Chapter = Literal["reference", "surrogates", "registration", "organs", "live", "data"]
 CHAPTERS: dict[Chapter, str] = {
@@ -140,6 +146,31 @@ def table(rows: Iterable[Row]) -> str:
     return "\n".join(lines)
 
 
+def choices() -> str:
+    """What registration has chosen, as one table of each kind: meaning, value, source, half and twice."""
+    whole = load("policy")
+    record, parts = whole["figures"], [f"Record of {whole['commit']}, {whole['date']}."]
+    for title, kind in (("Answers depend on these", POLICY), ("These change time", ACCURACY)):
+        lines = ["| number | meaning | value | source | at half | at twice |", "|---|---|---|---|---|---|"]
+        for each in fields(kind):
+            about, row = each.metadata, record.get(each.name)
+            value = getattr(kind, each.name)
+            half, twice = (_changed(row, value, factor) for factor in ("half", "twice"))
+            told = f"{value:g} {about['unit']}".strip()
+            lines.append(f"| `{each.name}` | {about['meaning']} | {told} | {about['source']} | {half} | {twice} |")
+        parts.append(f"## {title}\n\n" + "\n".join(lines))
+    return "\n\n".join(parts)
+
+
+def _changed(row: dict[str, Any] | None, value: float, factor: str) -> str:
+    """What a number at half or twice its value has changed: of the error, and how many verdicts."""
+    if row is None or row["value"] != value:
+        return "not yet"
+    told = row[factor]
+    verdicts = f"; verdicts: {told['verdicts_changed']}" if told["verdicts_changed"] else ""
+    return f"{told['error_percent']:+.1f} ± {told['error_percent_deviation']:.1f} %{verdicts}"
+
+
 def tables() -> dict[str, str]:
     """The table of each page, by its file's stem."""
     found = {"index": table(row for row in ROWS if row.front)}
@@ -168,6 +199,7 @@ def main() -> int:
         path = PAGES / f"{stem}.md"
         path.write_text(placed(path.read_text(), text))
         print(f"written: {path.relative_to(PAGES.parents[1])}, {text.count(chr(10)) - 1} rows")
+    CHOICES.write_text(placed(CHOICES.read_text(), choices()))
     return 0
 
 

@@ -149,7 +149,7 @@ class LocalModel:
     def _root(self) -> Floats:
         return np.sqrt(self.counted) / self.deviations
 
-    def told_of(self, columns: Floats) -> tuple[Floats, Floats]:
+    def score_of(self, columns: Floats) -> tuple[Floats, Floats]:
         """Slope of the logarithm of the likelihood by parameters that are none here, (m,), and its covariance, (m, m).
 
         All unknowns are integrated out with what is believed of them.

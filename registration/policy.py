@@ -134,11 +134,11 @@ class Policy:
     force_reach_surrogate: float = choice(
         0.01,
         "sizes of the body",
-        "the same of a model that errs: with more, the forces' doubt is larger than their error",
+        "the same of a model that errs: with more, the forces' uncertainty is larger than their error",
         "robustness, surrogate: no zone",
     )
     few_points: int = count(300, "", "points of a cloud that look for the place of the forces", "policy")
-    rounds: int = count(2, "", "rounds of gathering forces", "policy")
+    rounds: int = count(2, "", "reweighting rounds", "policy")
 
     # From where on a result is doubtful; refused, where that is possible, beyond `refused` times the level.
     unlikely: float = choice(
@@ -214,7 +214,7 @@ class Accuracy:
         1.0, "posterior deviations a coefficient", "a shorter step ends the search with a first loss"
     )
     graduation: float = choice(
-        1.0, "of what a step promises to change", "least noise that is believed far from the minimum"
+        1.0, "of what a step promises to change", "least noise far from the minimum"
     )
     first_step: float = choice(0.05, "sizes of the body", "first limit on the movement of a node in one step")
     iterations: int = count(40, "", "most iterations of Gauss-Newton")
@@ -245,7 +245,7 @@ class Accuracy:
         "size of forces elsewhere, where no zone is told: large ones at the place would make them free everywhere",
         "robustness, surrogate: no zone, clean; four times as much makes it worse, a fifth of it does not matter",
     )
-    surface_modes: int = count(48, "", "modes of the observed side for each component of shared noise", "policy")
+    surface_modes: int = count(48, "", "modes of the observed surface for each component of shared noise", "policy")
     carried: float = choice(0.9, "of its variance", "what modes carry of a model's error beside its patterns")
     points: int = count(1000, "", "larger clouds are thinned to so many points")
     leading: int = count(6, "", "directions of force that a cold start begins with")

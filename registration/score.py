@@ -51,7 +51,7 @@ def scores(local: LocalModel, *columns: Floats) -> list[Score | None]:
         columns: derivatives of the distances by the parameters of each set, (p, m).
     """
     every = np.hstack(columns)
-    pull, information = local.told_of(every)
+    pull, information = local.score_of(every)
     scales = np.square(every / local.deviations[:, None]).sum(axis=0)
     ends = np.cumsum([each.shape[1] for each in columns])
     parts = [slice(end - each.shape[1], end) for end, each in zip(ends, columns, strict=True)]
@@ -106,7 +106,7 @@ class _SharedNoise:
     def __init__(self, local: LocalModel, problem: Problem) -> None:
         assert problem.shared is not None
         self._modes, hyperprior = problem.shared.modes, problem.hyperprior
-        pull, self._covariance = local.told_of(problem.shared.by_points(local.evaluation))
+        pull, self._covariance = local.score_of(problem.shared.by_points(local.evaluation))
         weights, scaled = local.weights, local.problem.residuals(local.evaluation, local.own) / local.deviations
         shrunk = float(np.sum((weights * scaled) ** 2) / max(weights.sum(), 1e-300))
         self._pull = pull / np.sqrt(max(shrunk, 1e-300))

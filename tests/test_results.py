@@ -18,6 +18,11 @@ def test_a_page_shows_its_records(stem: str) -> None:
     assert dashboard.placed(page, dashboard.tables()[stem]) == page, "run `python benchmarks/dashboard.py`"
 
 
+def test_the_page_of_choices_shows_all_of_them() -> None:
+    page = dashboard.CHOICES.read_text()
+    assert dashboard.placed(page, dashboard.choices()) == page, "run `python benchmarks/dashboard.py`"
+
+
 @pytest.mark.parametrize("stem", ["index", *dashboard.CHAPTERS])
 def test_a_page_is_no_longer_than_it_may_be(stem: str) -> None:
     rows = [line for line in (PAGES / f"{stem}.md").read_text().splitlines() if re.match(r"\|(?!---)", line)]
