@@ -294,11 +294,11 @@ class Evidence:
             nearby[place] += _STEP
             bent = (self.prior(nearby)[1] - slopes)[places] / _STEP, (self.noise(nearby)[1] - by_noise)[places] / _STEP
             slope, weighed = slopes[place], by_noise[place] * precision
-            grown = np.diag(slope)
+            grown = slope[:, None] * inverse
             if weighed.any():
                 part = (weighed @ problem.information.reshape(len(weighed), -1)).reshape(matrix.shape)
-                grown += root[:, None] * part * root
-            changed = inverse @ grown @ inverse
+                grown += (root[:, None] * part * root) @ inverse
+            changed = inverse @ grown
             shift = inverse @ (slope * mean - root * (weighed @ upon))
             by_prior = slope * (np.diag(inverse) + mean**2) - np.diag(changed) - 2.0 * mean * shift
             by_data = problem.upper @ (root[:, None] * changed * root).ravel() - 2.0 * upon @ (root * shift)

@@ -45,7 +45,7 @@ class SparseLocalisation:
     rounds: int = field(default_factory=lambda: POLICY.rounds)
     reach: float = field(default_factory=lambda: POLICY.force_reach)
     informed: LikelihoodInformed = field(default_factory=LikelihoodInformed)
-    points: int = field(default_factory=lambda: POLICY.few_points)
+    points: int = field(default_factory=lambda: ACCURACY.few_points)
 
     def __post_init__(self) -> None:
         if self.points < 1:

@@ -137,7 +137,6 @@ class Policy:
         "the same of a model that errs: with more, the forces' uncertainty is larger than their error",
         "robustness, surrogate: no zone",
     )
-    few_points: int = count(300, "", "points of a cloud that look for the place of the forces", "policy")
     rounds: int = count(2, "", "reweighting rounds", "policy")
 
     # From where on a result is doubtful; refused, where that is possible, beyond `refused` times the level.
@@ -213,9 +212,7 @@ class Accuracy:
     handed_on: float = choice(
         1.0, "posterior deviations a coefficient", "a shorter step ends the search with a first loss"
     )
-    graduation: float = choice(
-        1.0, "of what a step promises to change", "least noise far from the minimum"
-    )
+    graduation: float = choice(1.0, "of what a step promises to change", "least noise far from the minimum")
     first_step: float = choice(0.05, "sizes of the body", "first limit on the movement of a node in one step")
     iterations: int = count(40, "", "most iterations of Gauss-Newton")
     few_iterations: int = count(8, "", "most for a start, and before noise that neighbours share is thought of")
@@ -246,6 +243,7 @@ class Accuracy:
         "robustness, surrogate: no zone, clean; four times as much makes it worse, a fifth of it does not matter",
     )
     surface_modes: int = count(48, "", "modes of the observed surface for each component of shared noise", "policy")
+    few_points: int = count(300, "", "points of a cloud that look for the place of the forces", "policy")
     carried: float = choice(0.9, "of its variance", "what modes carry of a model's error beside its patterns")
     points: int = count(1000, "", "larger clouds are thinned to so many points")
     leading: int = count(6, "", "directions of force that a cold start begins with")

@@ -1,4 +1,4 @@
-"""From rest: the leading directions of force first, then all; and once more for each round of gathering the forces."""
+"""From rest: the leading directions of force first, then all; each round of gathering the forces goes on from there."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from softtwin.reference.data.outcome import NotConverged
 
 from ..cloud import Cloud
 from ..gauss_newton import GaussNewton, SolverResult
@@ -44,9 +46,21 @@ def localise(setup: Setup, points: Cloud) -> Localised:
     for left in reversed(range(rule.rounds)):
         if setup.is_hopeless(found) or setup.is_late:
             break
-        prepared = _gathered(setup, prepared.forces.forces(found.evaluation.coefficients[: prepared.forces.size]))
-        found = after(found, from_rest(setup, few if left else points, prepared, solver))
+        nodal = prepared.forces.forces(found.evaluation.coefficients[: prepared.forces.size])
+        prepared, seen = _gathered(setup, nodal), few if left else points
+        try:
+            again = _carried_on(setup.plain(seen, prepared), solver, found, nodal)
+        except NotConverged:  # gathered, such forces may have no state
+            again = from_rest(setup, seen, prepared, solver)
+        found = after(found, again)
     return Localised(prepared, found, is_gathered)
+
+
+def _carried_on(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResult, nodal: Floats) -> SolverResult:
+    """With gathered forces, from those of them that are nearest to the ones found, (n, 3), newtons."""
+    start = problem.carried(found.evaluation.coefficients, found.local.problem)
+    start[problem.force_part] = problem.forces.nearest(nodal)
+    return solver.solve(problem, start, found.evaluation, found.local.eta)
 
 
 def from_rest(setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> SolverResult:
