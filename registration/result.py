@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from .evaluation import Evaluation
 from .forward import State
@@ -235,7 +235,7 @@ class Registration:
         """
         part = self.problem.pose_part
         off, covariance = self.coefficients[part], self.posterior.covariance[part, part]
-        return float(chi2.sf(off @ np.linalg.solve(covariance, off), len(off))) if len(off) else 1.0
+        return float(chdtrc(len(off), off @ np.linalg.solve(covariance, off))) if len(off) else 1.0
 
     @cached_property
     def force_over_modulus(self) -> tuple[Floats, Floats] | None:

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from softtwin.meshes.embedding import Embedding
 
@@ -107,7 +107,7 @@ class Uncertainty:
 def _log_quantile(confidence: float) -> CubicSpline:
     """Logarithm of chi-square's quantile by its degrees of freedom, 1 to 3 as a law of three components has."""
     freedom = np.linspace(0.99, 3.01, 203)
-    return CubicSpline(freedom, np.log(chi2.ppf(confidence, freedom)))
+    return CubicSpline(freedom, np.log(chdtri(freedom, 1.0 - confidence)))
 
 
 def unseen_response(model: ReducedModel, forces: NodalForces) -> Floats:

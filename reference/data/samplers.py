@@ -7,7 +7,6 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import outer, outer_nodes
@@ -98,6 +97,8 @@ def sobol_point(plan: LoadPlan, more: int, number: int, seed: int) -> Floats:
         seed: of the scrambling.
     """
     size = 1 + plan.patches * (3 + plan.modes) + more
+    from scipy.stats import qmc  # half a second, which only who draws it waits for
+
     sequence = qmc.Sobol(size, seed=seed)
     point: Floats = sequence.fast_forward(number).random(1)[0] if number else sequence.random(1)[0]
     return point
