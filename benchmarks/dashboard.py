@@ -149,8 +149,8 @@ def table(rows: Iterable[Row]) -> str:
 def choices() -> str:
     """What registration has chosen, as one table of each kind: meaning, value, source, half and twice."""
     whole = load("policy")
-    record, parts = whole["figures"], [f"Record of {whole['commit']}, {whole['date']}."]
-    for title, kind in (("Answers depend on these", POLICY), ("These change time", ACCURACY)):
+    record, parts = whole["figures"], [_of(whole)]
+    for title, kind in (("Answers depend on these", POLICY), ("How closely, or how much of it", ACCURACY)):
         lines = ["| number | meaning | value | source | at half | at twice |", "|---|---|---|---|---|---|"]
         for each in fields(kind):
             about, row = each.metadata, record.get(each.name)
@@ -162,10 +162,16 @@ def choices() -> str:
     return "\n\n".join(parts)
 
 
+def _of(record: dict[str, Any]) -> str:
+    """Where the last two columns come from."""
+    clouds = max(row["clouds"] for row in record["figures"].values())
+    return f"The last two columns: {clouds} clouds, code of commit {record['commit']}, {record['date']}."
+
+
 def _changed(row: dict[str, Any] | None, value: float, factor: str) -> str:
     """What a number at half or twice its value has changed: of the error, and how many verdicts."""
     if row is None or row["value"] != value:
-        return "not yet"
+        return "not measured"
     told = row[factor]
     verdicts = f"; verdicts: {told['verdicts_changed']}" if told["verdicts_changed"] else ""
     return f"{told['error_percent']:+.1f} ± {told['error_percent_deviation']:.1f} %{verdicts}"
@@ -200,6 +206,7 @@ def main() -> int:
         path.write_text(placed(path.read_text(), text))
         print(f"written: {path.relative_to(PAGES.parents[1])}, {text.count(chr(10)) - 1} rows")
     CHOICES.write_text(placed(CHOICES.read_text(), choices()))
+    print(f"written: {CHOICES.relative_to(PAGES.parents[1])}")
     return 0
 
 

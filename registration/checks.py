@@ -198,10 +198,12 @@ def _blocks(problem: Problem, found: SolverResult, expected: Expectations) -> It
 
 def _left_out(problem: Problem, found: SolverResult) -> Iterator[Check]:
     """What is no unknown here, and would explain the cloud better: its scale, and a pose that was given as exact."""
-    of_scale, of_pose = scores(found.local, by_scale(found.local), by_rigid_motion(found.local))
+    local = found.local
+    motion = by_rigid_motion(local) if problem.pose is None else np.zeros((len(problem.cloud), 0))
+    of_scale, of_pose = scores(local, by_scale(local), motion)
     if of_scale is not None:
         yield _scored(Code.SCALE, of_scale, False, "")  # see `score.by_scale`: shown, and decides nothing
-    if problem.pose is None and of_pose is not None:
+    if of_pose is not None:
         turn, shift = (float(np.linalg.norm(part)) for part in np.split(of_pose.estimate, 2))
         matters = max(turn * problem.observed.body.size / 2.0, shift) > problem.noise.median
         odd = (

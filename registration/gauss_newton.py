@@ -24,8 +24,6 @@ from .problem import Problem
 from .score import gain_by_shared_noise
 
 Floats = NDArray[np.float64]
-_USUAL = 0.5  # of the last step's length: the next one's, where that step says nothing of it
-_SLOWEST = 0.75  # the most that is believed of it: closest points jump, and steps do not shrink for ever
 
 
 @dataclass(frozen=True)
@@ -198,7 +196,8 @@ class _Search:
         self.evaluation = _begun(self.problem, start, near)
         self.evaluations, self.limit = 1, self._first_limit
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
-        self.own, self.begun = 0.0, 0
+        self.own, self.begun, self.comparable = 0.0, 0, 0
+        self.takes_last = options.graduation > 0.0
         self.eta, self.starts = eta, list[Floats]()
         self.trace: list[IterationRecord] = []
         self._at: LocalModel | None = None
@@ -214,22 +213,32 @@ class _Search:
         if self.problem is self.whole:
             outcome = self._descend(last, options.settled)
         else:  # points far off are told first, then what neighbours share
-            outcome = self._descend(last, options.settled, ACCURACY.few_iterations)
+            outcome = self._descend(last, options.settled, min(ACCURACY.few_iterations, options.max_iterations))
             self.begun, is_whole = len(self.trace), self._takes_whole(last)
             if not is_whole and outcome is not Outcome.CONVERGED:
                 outcome = self._descend(last, options.settled)
                 is_whole = self._takes_whole(last)
             if is_whole:
                 ended.append(outcome)
+                self.begun = self.comparable = len(self.trace)
                 outcome = self._descend(last, options.settled)
-        if outcome in (Outcome.NO_DESCENT, Outcome.MAXIMUM_ITERATIONS, Outcome.OUT_OF_TIME) and self._has_enough():
-            outcome = Outcome.CONVERGED
+        outcome, local = self._concluded(outcome, last)
         if Outcome.OUT_OF_TIME in ended:  # far off, the last loss takes all points for outliers, and is content
             outcome = Outcome.OUT_OF_TIME
-        local = self._local(self.options.losses[-1])
-        if outcome is Outcome.CONVERGED and options.graduation > 0.0:
-            local = self._ended(local)
         return SolverResult.at(local, outcome, self.evaluations, tuple(self.trace))
+
+    def _concluded(self, outcome: Outcome, loss: Loss) -> tuple[Outcome, LocalModel]:
+        """How it ended, and the model there, after the last step; where that helps nothing, the search goes on."""
+        if outcome in (Outcome.NO_DESCENT, Outcome.MAXIMUM_ITERATIONS, Outcome.OUT_OF_TIME) and self._has_enough():
+            outcome = Outcome.CONVERGED
+        local = self._local(loss)
+        if outcome is not Outcome.CONVERGED or not self.takes_last:
+            return outcome, local
+        after = self._ended(local)
+        if after is not local or local.length < self.options.enough:
+            return outcome, after
+        self.takes_last = False
+        return self._concluded(self._descend(loss, self.options.settled), loss)
 
     def _takes_whole(self, loss: Loss) -> bool:
         """Goes on with noise that neighbours share, where that may make the cloud more likely and does."""
@@ -282,17 +291,15 @@ class _Search:
     def _descend(self, loss: Loss, settled: float, most: int = 0) -> Outcome:
         most = len(self.trace) + most if most else self.begun + self.options.max_iterations
         is_handed_on, is_exact = settled >= self.options.handed_on, False
+        left = float if is_handed_on else self._left
         while len(self.trace) < most:
             local = self._local(loss)
-            if local.is_carried and (self._left(local.length) >= settled or local.is_graduated):
+            if local.is_carried and (left(local.length) >= settled or local.is_graduated):
                 local = self._renewed(loss)
-            if self._left(local.length) < settled and not local.is_graduated:
+            if left(local.length) < settled and not local.is_graduated:
                 if is_handed_on or is_exact:
                     return Outcome.CONVERGED
-                if (
-                    self._left(self._closest_length(local)) < settled
-                    and self._left(self._local(loss).length) < self.options.enough
-                ):
+                if left(self._closest_length(local)) < settled and left(self._local(loss).length) < self.options.enough:
                     return Outcome.CONVERGED
                 is_exact = True
                 continue
@@ -329,15 +336,18 @@ class _Search:
     def _left(self, length: float) -> float:
         """How long the steps after the next will be in all, where each is shorter than the last by the same factor.
 
-        What simplified Newton iterations are stopped by (Hairer and Wanner 1996, IV.8).
+        What simplified Newton iterations are stopped by (Hairer and Wanner 1996, IV.8). Where nothing is known of the
+        factor, and where the next is long or will not be taken, its own length.
 
         Args:
             length: of the next.
         """
-        before = self.trace[-1] if self.trace else None
-        rate = _USUAL
-        if before is not None and abs(before.gain - 1.0) < ACCURACY.kept:  # else what it promised was wrong
-            rate = min(length / before.length, _SLOWEST)
+        known = self.trace[self.comparable :]
+        if not known or abs(known[-1].gain - 1.0) >= ACCURACY.kept or not self.takes_last:
+            return length
+        if length >= self.options.handed_on:
+            return length
+        rate = min(length / known[-1].length, ACCURACY.slowest)
         return length * rate / (1.0 - rate)
 
     def _closest_length(self, local: LocalModel) -> float:

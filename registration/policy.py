@@ -1,8 +1,8 @@
 """Numbers of the registration that are choices: what each means, where it comes from, in two tables.
 
 Answers depend on those of `POLICY`: who changes one runs `benchmarks/guards.py` before and after. Those of `ACCURACY`
-say how closely something is computed, or how much of it is looked at: with half or twice of one, answers stay what they
-were, and time changes. `benchmarks/policy.py` says of each number what happens at half and at twice its value.
+say how closely something is computed, or how much of it is looked at: with more of it answers stay what they were, and
+time changes. `benchmarks/policy.py` says of each number what happens at half and at twice its value.
 Constants of the literature (Huber's 1.345, the rules of a trust region) stand where they are used, with their source.
 """
 
@@ -199,7 +199,7 @@ class Policy:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How closely, or how much of it: numbers that change time and not answers."""
+    """How closely, or how much of it: with more, answers stay what they were, and time changes."""
 
     settled: float = choice(
         0.2, "posterior deviations a coefficient", "the search has ended where so much is left after one more step"
@@ -209,8 +209,15 @@ class Accuracy:
         "posterior deviations a coefficient",
         "so has one that lowers the objective no further before a longer step",
     )
+    slowest: float = choice(
+        0.75,
+        "of the length of the step before",
+        "most that the next step is taken to have: closest points jump, and steps do not shrink for ever",
+    )
     handed_on: float = choice(
-        1.0, "posterior deviations a coefficient", "a shorter step ends the search with a first loss"
+        1.0,
+        "posterior deviations a coefficient",
+        "a shorter step ends the search with a first loss; no longer one is last",
     )
     graduation: float = choice(1.0, "of what a step promises to change", "least noise far from the minimum")
     first_step: float = choice(0.05, "sizes of the body", "first limit on the movement of a node in one step")

@@ -55,7 +55,7 @@ def scores(local: LocalModel, *columns: Floats) -> list[Score | None]:
     scales = np.square(every / local.deviations[:, None]).sum(axis=0)
     ends = np.cumsum([each.shape[1] for each in columns])
     parts = [slice(end - each.shape[1], end) for end, each in zip(ends, columns, strict=True)]
-    lost = np.finfo(float).eps * len(every)
+    lost = float(np.finfo(float).eps) * len(every)
     return [_score(pull[part], information[part, part], lost * float(scales[part].max(initial=0.0))) for part in parts]
 
 

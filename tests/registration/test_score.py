@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from softtwin.meshes.body import Body
 from softtwin.registration.gauss_newton import GaussNewton
-from softtwin.registration.hyperparameters import SHARED, LogNormalPrior
+from softtwin.registration.hyperparameters import LENGTH, SHARED, LogNormalPrior
 from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Square
 from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
@@ -133,7 +133,8 @@ def test_what_shared_noise_may_explain_is_known_before_it_is_sought(registrar: R
     local, whole = least_squares(registrar, cloud + size * np.sin(cloud @ waves))
     gain, log_size, log_length = gain_by_shared_noise(local, whole)
     prior = whole.hyperprior
-    cost = 0.5 * ((log_size - prior.median[SHARED]) / prior.spread[SHARED]) ** 2
+    off = (np.array([log_size, log_length]) - prior.median[[SHARED, LENGTH]]) / prior.spread[[SHARED, LENGTH]]
+    cost = 0.5 * float(off @ off)
     none, some = (evidence_with(local, whole, part, np.exp(log_length)) for part in (0.0, np.exp(log_size)))
     assert gain > 10.0 and some - none - cost == pytest.approx(gain, rel=0.1)  # squares count as if their mean were 1
     assert 0.3 * size < np.exp(log_size) < 3.0 * size
@@ -141,7 +142,7 @@ def test_what_shared_noise_may_explain_is_known_before_it_is_sought(registrar: R
 
 def test_noise_of_its_own_is_seldom_thought_to_be_shared(registrar: Registrar) -> None:
     gains = [gain_by_shared_noise(*least_squares(registrar, some_cloud(registrar, seed)))[0] for seed in range(20)]
-    assert np.mean(np.greater(gains, 0.0)) <= 0.2
+    assert gains == [-np.inf] * 20
 
 
 def test_a_problem_without_shared_noise_gains_nothing(registrar: Registrar) -> None:
