@@ -4,12 +4,12 @@
 
 Nodal forces are drawn as the registration believes: smooth over a zone, their size log-normal about the one told (in
 the rows of points spread as much as it believes, in the others by half more). The reference solves them, and a noisy
-cloud of 500 points of one side shows them; the surrogate registers it from rest, told neither noise nor size. Covered is the share of nodes whose error lies within the margin, and of net forces
-within their region (chi-square, three components). z are the net force's errors in the coordinates in which its
-covariance is one: three standard normal numbers a case, if the doubt is right. Ranks are those of the truth in the
-posterior (simulation-based calibration, Talts et al. 2018), here by its normal law: uniform if right. The largest
-distance of their distribution from the uniform one is given with Kolmogorov's 95 % envelope. Refused frames are counted
-and left out.
+cloud of 500 points of one side shows them; the surrogate registers it from rest, told neither noise nor size. Covered
+is the share of nodes whose error lies within the margin, and of net forces within their region (chi-square, three
+components). z are the net force's errors in the coordinates in which its covariance is one: three standard normal
+numbers a case, if the doubt is right. Ranks are those of the truth in the posterior (simulation-based calibration,
+Talts et al. 2018), here by its normal law: uniform if right. The largest distance of their distribution from the
+uniform one is given with Kolmogorov's 95 % envelope. Refused frames are counted and left out.
 
 `any camera`: each case has another noise (0.3 to 3 mm), number of points (100 to 1,000) and share of the side that is
 seen (a quarter to all of it, in one piece), so that predicted errors differ by more than chance. `300 points` to
