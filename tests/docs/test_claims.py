@@ -52,7 +52,7 @@ def test_the_page_claims_no_conformity_and_no_living_organ() -> None:
 
 
 def test_coverage_is_quoted_as_the_results_have_it() -> None:
-    table = (DOCS / "method" / "registration.md").read_text().partition("## How often the truth kept the margins")[2]
+    table = (DOCS / "method" / "posterior.md").read_text().partition("## How often the truth kept the margins")[2]
     rows = re.findall(r"^\| ([^|]+) \| (\d+) \| (\d+) \| (\d+) \|", table, flags=re.M)
     assert len(rows) >= 9
     assert [row for row in rows if " / ".join(row[1:]) not in RESULTS] == []
@@ -61,7 +61,7 @@ def test_coverage_is_quoted_as_the_results_have_it() -> None:
 def test_the_guide_quotes_coverage_that_the_method_page_has() -> None:
     guide = (DOCS / "registration.md").read_text()
     shares = re.findall(r"h[eo]ld (\d+) %\s+of the\s+nodes(?: without the ensemble and (\d+) % with it)?", guide)
-    rows = (DOCS / "method" / "registration.md").read_text().partition("## How often the truth kept the margins")[2]
+    rows = (DOCS / "method" / "posterior.md").read_text().partition("## How often the truth kept the margins")[2]
     assert sorted(share for found in shares for share in found if share) == ["69", "73", "92"]
     assert all(f"| {share} |" in rows for share in ("69", "73", "92"))
 
