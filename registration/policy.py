@@ -238,7 +238,7 @@ class Accuracy:
         3.0,
         "of the logarithm of the evidence",
         "least gain by noise that neighbours share for which it is sought: strong (Kass and Raftery 1995)",
-        "clouds without any: at most 1.8; with 0.2 to 1 mm of it none of less gain was found to have it",
+        "misspecified, noise that neighbours share",
     )
     shared_length_minimum: float = choice(
         1.75, "edges of the surface", "least of it: shorter fields are those of the mesh", "liver_engines, remeshed"
