@@ -269,9 +269,9 @@ class Evidence:
     def curvature(self, eta: Floats, places: Ints) -> Floats:
         """Second derivatives of minus the logarithm, (q, q), exact but for those of the variances.
 
-        With A = S^-1 scaled by the roots of v, z = m / sqrt(v), and N_b the part of A that the groups' variances change
-        with a hyperparameter b, S changes by S (diag(s_b) + N_b) S and m by S (s_b z - c_b), where s_b are the slopes
-        of log v and c_b those of what the residuals at m pull; the gradient is differentiated by these.
+        With S^-1 scaled by the roots of v, z = m / sqrt(v), D_b the slopes of log v by a hyperparameter b, N_b the part
+        of S^-1 that the groups' variances change with it, and p_b = D_b z - c_b, where c_b are those changes of what the
+        residuals at m pull: S changes by S (D_b + N_b) S and z by S p_b, and the gradient is differentiated by these.
 
         Args:
             eta: logarithms of the hyperparameters, (h,).
@@ -288,22 +288,20 @@ class Evidence:
         data = problem.square + problem.tail - 2.0 * problem.projection @ moved
         data += problem.upper @ (spread + moved[:, None] * moved).ravel()
         told, fit = 1.0 - np.diag(inverse) - mean**2, problem.count - precision * data
-        found = np.zeros((len(places), len(places)))
+        sloped, weighed = slopes[places], by_noise[places] * precision
+        pulls = sloped * mean - root * (weighed @ upon)
+        grown = sloped[:, :, None] * inverse  # (D_b + N_b) S
+        for each in np.flatnonzero(weighed.any(axis=1)):
+            part = (weighed[each] @ problem.information.reshape(len(precision), -1)).reshape(matrix.shape)
+            grown[each] += (root[:, None] * part * root) @ inverse
+        flat = (len(places), -1)
+        found = (sloped * (np.diag(inverse) + mean**2)) @ sloped.T + (by_noise[places] * data) @ weighed.T
+        found -= grown.reshape(flat) @ grown.transpose(0, 2, 1).reshape(flat).T + 2.0 * pulls @ inverse @ pulls.T
         for column, place in enumerate(places):
             nearby = eta.copy()
             nearby[place] += _STEP
-            bent = (self.prior(nearby)[1] - slopes)[places] / _STEP, (self.noise(nearby)[1] - by_noise)[places] / _STEP
-            slope, weighed = slopes[place], by_noise[place] * precision
-            grown = slope[:, None] * inverse
-            if weighed.any():
-                part = (weighed @ problem.information.reshape(len(weighed), -1)).reshape(matrix.shape)
-                grown += (root[:, None] * part * root) @ inverse
-            changed = inverse @ grown
-            shift = inverse @ (slope * mean - root * (weighed @ upon))
-            by_prior = slope * (np.diag(inverse) + mean**2) - np.diag(changed) - 2.0 * mean * shift
-            by_data = problem.upper @ (root[:, None] * changed * root).ravel() - 2.0 * upon @ (root * shift)
-            by_groups = weighed * data - precision * by_data
-            found[:, column] = slopes[places] @ by_prior + by_noise[places] @ by_groups + bent[0] @ told + bent[1] @ fit
+            found[:, column] += (self.prior(nearby)[1] - slopes)[places] @ told / _STEP
+            found[:, column] += (self.noise(nearby)[1] - by_noise)[places] @ fit / _STEP
         return 0.5 * found + np.diag(self.hyperprior.bend_at(eta)[places])
 
 
