@@ -92,7 +92,7 @@ def _fit(problem: Problem, found: SolverResult, expected: Expectations) -> Itera
         expected.noise,
         f"organ and cloud do not match: points lie {1e3 * noise:.1f} mm from the surface "
         f"(up to {1e3 * expected.noise:.1f} mm could be noise)",
-        refused=POLICY.refused * expected.noise,
+        refused=POLICY.excess * expected.noise,
         unit="m",
         law=_log_normal(noise, problem.noise),
     )
@@ -104,7 +104,7 @@ def _fit(problem: Problem, found: SolverResult, expected: Expectations) -> Itera
         expected.systematic,
         f"organ and cloud do not match: whole patches of the surface are {1e3 * systematic:.1f} mm off, which no noise "
         f"of points explains (up to {1e3 * expected.systematic:.1f} mm is let pass)",
-        refused=POLICY.refused * expected.systematic,
+        refused=POLICY.excess * expected.systematic,
         unit="m",
     )
     outliers = float(np.mean(~found.is_kept))
@@ -181,7 +181,7 @@ def _state(problem: Problem, state: State, expected: Expectations) -> Iterator[C
     ratio, limit = state.extrapolation_ratio, expected.extrapolation_ratio
     if ratio is not None:
         beyond = f"the load is {ratio:.1f} times the largest that the surrogate has learned"
-        yield checked(Code.LOAD, ratio, limit, beyond, refused=POLICY.refused * limit)
+        yield checked(Code.LOAD, ratio, limit, beyond, refused=POLICY.excess * limit)
     pivots = state.negative_pivots
     if pivots is not None:
         unstable = f"the state is unstable: {pivots} negative pivots of its tangent"

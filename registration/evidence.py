@@ -269,9 +269,9 @@ class Evidence:
     def curvature(self, eta: Floats, places: Ints) -> Floats:
         """Second derivatives of minus the logarithm, (q, q), exact but for those of the variances.
 
-        With S^-1 scaled by the roots of v, z = m / sqrt(v), D_b the slopes of log v by a hyperparameter b, N_b the part
-        of S^-1 that the groups' variances change with it, and p_b = D_b z - c_b, where c_b are those changes of what the
-        residuals at m pull: S changes by S (D_b + N_b) S and z by S p_b, and the gradient is differentiated by these.
+        With S^-1 scaled by the roots of v, z = m / sqrt(v), D_b the slopes of log v by a hyperparameter b, N_b what
+        S^-1 loses with the groups' variances by it, and p_b = D_b z - c_b, where c_b is as much of what the residuals
+        at m pull: S changes by S (D_b + N_b) S and z by S p_b, and the gradient is differentiated by these.
 
         Args:
             eta: logarithms of the hyperparameters, (h,).

@@ -25,9 +25,9 @@ class Expectations:
         unlikely: chance of a pose, of another parameter or a landmark that lies too far from where it was expected.
         gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
         discrepancy_scale: how often as large as it was seen to be what the model gets wrong may be taken.
-        correction: however large beside what was seen, so little of it harms nobody: of an observed node, metres.
+        correction: however large beside what was seen, less than a camera sees harms nobody: of an observed node, metres.
         minimum_variance_reduction: part of the variance of such a parameter, and of every combination of them, that a
-            cloud must take away where all forces are known.
+            cloud must take away where all forces are known: one half, and it tells as much as was believed.
     """
 
     noise: float
@@ -37,9 +37,9 @@ class Expectations:
     extrapolation_ratio: float = field(default_factory=lambda: POLICY.load)
     informed: float = field(default_factory=lambda: POLICY.minimum_directions)
     unlikely: float = field(default_factory=lambda: POLICY.unlikely)
-    discrepancy_scale: float = field(default_factory=lambda: POLICY.discrepancy)
+    discrepancy_scale: float = field(default_factory=lambda: POLICY.excess)
     correction: float = 0.0
-    minimum_variance_reduction: float = field(default_factory=lambda: POLICY.informed)
+    minimum_variance_reduction: float = 0.5
     gradient: float = np.inf
 
     @classmethod
@@ -52,9 +52,9 @@ class Expectations:
         """
         size = model.body.size
         return cls(
-            noise=max(POLICY.misfit * size, 3.0 * noise.median),
+            noise=max(POLICY.misfit * size, POLICY.deviations * noise.median),
             systematic=max(POLICY.misfit_shared * size, noise.median),
             movement=POLICY.movement * size,
-            correction=POLICY.harmless * size,
+            correction=POLICY.noise_minimum,
             gradient=POLICY.linear if getattr(model, "is_linear", False) else np.inf,
         )

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 
+from scipy.special import ndtri
+
 _CHANCE = "chance"  # unit of one
 
 
@@ -55,9 +57,6 @@ class Policy:
         "standard deviation of its logarithm: half a millimetre costs 1.7 in the logarithm of the evidence",
         "misspecified, noise that neighbours share",
     )
-    shared_size_maximum: float = choice(
-        5e-3, "m", "most of it: what is more is another place or another shape", "foreign_patches, raised by 5 mm"
-    )
     shared_length: float = choice(
         0.15,
         "of the root of the observed area",
@@ -96,12 +95,6 @@ class Policy:
         "part of a scale found below 1 that margins believe: forces explain some of what the model gets wrong",
         "robustness, surrogate: nodes in their margins; 0 holds too many of a clean cloud, 0.5 too few",
     )
-    discrepancy_along_normal: float = choice(
-        3.0,
-        "times the variance of a component",
-        "variance of a distance by what the model's patterns leave out: all of it may lie along the normal",
-        "robustness, surrogate: clean; errors of a network are largest across the surface that is pulled",
-    )
 
     # What is believed of the forces.
     force_size: float = choice(
@@ -139,7 +132,7 @@ class Policy:
     )
     rounds: int = count(2, "", "reweighting rounds", "policy")
 
-    # From where on a result is doubtful; refused, where that is possible, beyond `refused` times the level.
+    # From where on a result is doubtful; refused, where that is possible, beyond `excess` times the level.
     unlikely: float = choice(
         2.7e-3,
         _CHANCE,
@@ -154,25 +147,22 @@ class Policy:
         "verdict, right clouds",
     )
     misfit: float = choice(
-        0.025, "sizes of the body", "most of the points' noise, where three times what was expected is less", "verdict"
+        0.025,
+        "sizes of the body",
+        "most of the points' noise, where three times what was expected is less, and of what neighbours share of it: "
+        "what is more is another place or another shape",
+        "verdict; foreign_patches, raised by 5 mm",
     )
     misfit_shared: float = choice(
-        0.005, "sizes of the body", "most of what neighbours share of it, where what was expected is less", "verdict"
+        0.005,
+        "sizes of the body",
+        "most of what neighbours still share of the distances left, where what was expected is less",
+        "verdict",
     )
     movement: float = choice(0.35, "sizes of the body", "largest movement of a node", "largest in liver data: 0.2")
     outliers: float = choice(0.4, "", "largest share of points that may fit nowhere", "robustness: outliers")
     foreign: float = choice(0.2, "", "share of them from which on they may not form a surface", "foreign_patches")
     load: float = choice(1.2, "times the largest that was learned", "largest load of a network", "learning_limits")
-    discrepancy: float = choice(
-        1.5, "times what was seen", "most of what the model gets wrong", "verdict: patch of 30 % by 10 mm"
-    )
-    informed: float = choice(
-        0.5, "", "part of a direction's variance that a cloud has to take away, where all forces are known", "inclusion"
-    )
-    harmless: float = choice(5e-4, "sizes of the body", "correction by that error which harms nobody", "verdict")
-    normals: float = choice(
-        3.0, "times what was expected", "largest median lean of measured normals", "normals of turned frames"
-    )
     minimum_points: float = choice(30, "points", "fewest of a cloud", "verdict: few points")
     minimum_directions: float = choice(
         2.0, "directions", "fewest of what is unknown that a cloud tells", "verdict: few points"
@@ -182,12 +172,12 @@ class Policy:
     linear: float = choice(
         0.03, "radians, strain", "largest turn or stretch of a linear law: half of it is off by", "linear_response"
     )
-    refused: float = choice(1.5, "times the level", "from there on a result is of no use", "verdict: another organ")
-    lost: float = choice(
+    excess: float = choice(
         1.5,
-        "times the distances of the last frame",
-        "from there on a cloud is searched for from rest",
-        "liver sequences: frames of changed places of force",
+        "times what was to be expected",
+        "so much above a level no result is of use; so much more than it was seen to be, the model's error explains "
+        "nothing; at so much larger distances than in the last frame a cloud is searched for from rest",
+        "verdict: another organ, patch of 30 % by 10 mm; liver sequences: frames of changed places of force",
     )
     elsewhere: float = choice(
         0.5,
@@ -195,6 +185,11 @@ class Policy:
         "less of them left with forces elsewhere, or with one contact not: forces act otherwise than was said",
         "contact, robustness: no zone",
     )
+
+    @property
+    def deviations(self) -> float:
+        """How many standard deviations of one number are as unlikely."""
+        return -float(ndtri(0.5 * self.unlikely))
 
 
 @dataclass(frozen=True)

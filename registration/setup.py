@@ -185,4 +185,4 @@ class Setup:
         """Whether what was found is so far off that it is no state of this organ."""
         if found.outcome is Outcome.OUT_OF_TIME:  # who knows
             return False
-        return found.local.noise > POLICY.refused * self.expectations.noise
+        return found.local.noise > POLICY.excess * self.expectations.noise

@@ -46,8 +46,9 @@ class CorrelatedNoise(ParameterBlock):
         least = ACCURACY.shared_length_minimum * observed.edge
         median = max(POLICY.shared_length * np.sqrt(self.modes.area), least)
         longest = POLICY.shared_length_maximum * median
+        most = POLICY.misfit * observed.body.size  # what is more is another place or another shape
         return {
-            SHARED: LogNormalPrior(POLICY.shared_size, POLICY.shared_size_spread, maximum=POLICY.shared_size_maximum),
+            SHARED: LogNormalPrior(POLICY.shared_size, POLICY.shared_size_spread, maximum=most),
             LENGTH: LogNormalPrior(median, POLICY.shared_length_spread, least, longest),
         }
 

@@ -23,6 +23,7 @@ from ..verdict import Check, Code, checked
 from .block import BlockPosterior, FieldBlock, ParameterBlock
 
 Floats = NDArray[np.float64]
+_COMPONENTS = 3.0  # whose variances add up along the normal: errors are largest across the surface that is pulled
 _SMOOTHNESS = 1.5  # of what the patterns leave out, as of all fields: once differentiable
 
 
@@ -54,7 +55,7 @@ class ModelError(FieldBlock):
     @cached_property
     def rest(self) -> RestOfModelError:
         """What the patterns leave out, as far as it is smooth."""
-        deviation = np.sqrt(POLICY.discrepancy_along_normal) * self.amplitude * self._left_out
+        deviation = np.sqrt(_COMPONENTS) * self.amplitude * self._left_out
         return RestOfModelError(deviation, *self._rest_modes)
 
     def hyperpriors(self, observed: SurfaceDistance) -> Mapping[int, LogNormalPrior]:

@@ -60,4 +60,4 @@ class Normals(ResidualTerm):
             f"the cloud's normals do not match: half of them lean by more than {median:.0f} degrees from the surface "
             f"found, where {expected:.0f} were expected"
         )
-        yield checked(Code.NORMALS, median, POLICY.normals * expected, lean, unit="degrees")
+        yield checked(Code.NORMALS, median, POLICY.deviations * expected, lean, unit="degrees")

@@ -32,7 +32,7 @@ def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
 
 def has_left(setup: Setup, found: Registration, last: Registration) -> bool:
     """True where the cloud is met so much worse than before that the forces may act elsewhere now."""
-    return found.scatter > POLICY.lost * max(last.scatter, setup.noise.minimum)
+    return found.scatter > POLICY.excess * max(last.scatter, setup.noise.minimum)
 
 
 def _is_nearer_at_rest(setup: Setup, near: Evaluation, last: Registration) -> bool:
