@@ -117,7 +117,7 @@ def options_for(model: ForwardModel, has_zone: bool) -> RegistrationOptions:
         return RegistrationOptions(localisation=localisation, hyperprior=ForceHyperprior(clear))
     if has_zone:
         return RegistrationOptions(localisation=SparseLocalisation(rounds=0, points=_MANY))
-    return RegistrationOptions(localisation=SparseLocalisation(reach=POLICY.force_reach_surrogate))
+    return RegistrationOptions()
 
 
 def expected_force(body: Body, young_modulus: float) -> float:

@@ -122,13 +122,10 @@ class Policy:
         2.0, "times the least noise", "a clearer cloud tells the size of the forces", "robustness, reference: clean"
     )
     force_reach: float = choice(
-        0.035, "sizes of the body", "forces within it are gathered together", "robustness, reference: no zone"
-    )
-    force_reach_surrogate: float = choice(
-        0.01,
+        0.02,
         "sizes of the body",
-        "the same of a model that errs: with more, the forces' uncertainty is larger than their error",
-        "robustness, surrogate: no zone",
+        "forces within it are gathered together: with more, their uncertainty is larger than their error",
+        "robustness: no zone",
     )
     rounds: int = count(2, "", "reweighting rounds", "policy")
 
@@ -243,6 +240,9 @@ class Accuracy:
         "of the size at the place where forces were found",
         "size of forces elsewhere, where no zone is told: large ones at the place would make them free everywhere",
         "robustness, surrogate: no zone, clean; four times as much makes it worse, a fifth of it does not matter",
+    )
+    force_size_maximum: float = choice(
+        10.0, "times the size expected", "forces so large decide which directions a cloud may tell"
     )
     surface_modes: int = count(48, "", "modes of the observed surface for each component of shared noise", "policy")
     few_points: int = count(300, "", "points of a cloud that look for the place of the forces", "policy")

@@ -42,7 +42,7 @@ class Prepared:
 
     def informed(self, observed: SurfaceDistance, rule: LikelihoodInformed) -> Prepared:
         """The directions that a cloud can tell: see `likelihood_informed`."""
-        kept = likelihood_informed(self.model, observed, rule)
+        kept = likelihood_informed(self.model, observed, rule, self.forces.scale.median)
         return Prepared(self.forces.combined(kept), self.model.combined(kept))
 
     def leading(self, count: int) -> Prepared:

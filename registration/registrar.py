@@ -341,7 +341,7 @@ def prepare(
         if inputs is not None:
             carrying = np.setdiff1d(carrying, inputs.moved_nodes)
         every = nodal_forces(model.body, carrying, scale, smoothness)
-        rule = LikelihoodInformed(options.noise.minimum, scale=10.0 * force_scale, maximum=directions)
+        rule = LikelihoodInformed(options.noise.minimum, maximum=directions)
         forces = Prepared.of(model, observed, every, inputs).informed(observed, rule).forces
 
     def anywhere() -> Registrar:

@@ -195,19 +195,21 @@ class LikelihoodInformed:
     Args:
         noise: least noise of a point expected, metres.
         points: number of points of a cloud expected.
-        scale: largest scale of the coefficients expected, newtons.
+        size: largest size of the forces reckoned with, times the one expected.
         information: directions whose expected information, in units of the prior's, is below this are left out.
         maximum: most directions kept.
     """
 
     noise: float = 1e-4
     points: int = 500
-    scale: float = 0.03
+    size: float = field(default_factory=lambda: ACCURACY.force_size_maximum)
     information: float = 0.5
     maximum: int = 96
 
 
-def likelihood_informed(model: ReducedModel, observed: SurfaceDistance, rule: LikelihoodInformed) -> Floats:
+def likelihood_informed(
+    model: ReducedModel, observed: SurfaceDistance, rule: LikelihoodInformed, scale: float
+) -> Floats:
     """Orthonormal combinations of a force basis that a cloud can tell at rest, (k, kept), those told best first.
 
     They are the leading eigenvectors of the prior-whitened Gauss-Newton matrix at rest: the likelihood-informed
@@ -217,10 +219,11 @@ def likelihood_informed(model: ReducedModel, observed: SurfaceDistance, rule: Li
         model: between the coefficients of the basis and the observed nodes.
         observed: the observed side.
         rule: what is told from what.
+        scale: size of a force that is expected, newtons.
     """
     moved = model.solve(np.zeros(model.count)).jacobian(_observing_rows(observed))
     squares, vectors = np.linalg.eigh(moved.T @ moved)
-    information = squares[::-1] * (rule.scale / rule.noise) ** 2 * rule.points
+    information = squares[::-1] * (rule.size * scale / rule.noise) ** 2 * rule.points
     count = min(rule.maximum, max(int((information > rule.information).sum()), 1))
     return np.ascontiguousarray(vectors[:, ::-1][:, :count])
 
