@@ -25,7 +25,7 @@ class Expectations:
         unlikely: chance of a pose, of another parameter or a landmark that lies too far from where it was expected.
         gradient: largest turn or stretch that nearly all cells stay below; a law that is linear holds for small ones.
         discrepancy_scale: how often as large as it was seen to be what the model gets wrong may be taken.
-        correction: however large beside what was seen, less than a camera sees harms nobody: of an observed node, metres.
+        correction: however large beside what was seen, less than a camera sees harms nobody: of a node, metres.
         minimum_variance_reduction: part of the variance of such a parameter, and of every combination of them, that a
             cloud must take away where all forces are known: one half, and it tells as much as was believed.
     """
