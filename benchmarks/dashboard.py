@@ -21,7 +21,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from softtwin.registration.policy import ACCURACY, POLICY
+from softtwin.registration.policy import ACCURACY, POLICY, RIGID
 
 RESULTS = Path(__file__).parent / "results"
 PAGES = Path(__file__).parents[1] / "docs" / "results"
@@ -159,6 +159,14 @@ def choices() -> str:
             told = f"{value:g} {about['unit']}".strip()
             lines.append(f"| `{each.name}` | {about['meaning']} | {told} | {about['source']} | {half} | {twice} |")
         parts.append(f"## {title}\n\n" + "\n".join(lines))
+    lines = ["| number | meaning | value | source |", "|---|---|---|---|"]
+    for each in fields(RIGID):
+        about, value = each.metadata, getattr(RIGID, each.name)
+        told = ", ".join(f"{part:g}" for part in value) if isinstance(value, tuple) else f"{value:g}"
+        lines.append(
+            f"| `{each.name}` | {about['meaning']} | {(told + ' ' + about['unit']).strip()} | {about['source']} |"
+        )
+    parts.append("## The search for a pose that nobody gave\n\n" + "\n".join(lines))
     return "\n\n".join(parts)
 
 

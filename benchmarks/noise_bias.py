@@ -4,7 +4,7 @@
 
 At the truth of frames 0, 2, ... 8 of s1, s2, s3 of the public liver: the mean signed distance of noisy clouds, and the
 mean step of the net force that the linear response then asks for, along the true force and in its deviations (Tukey's
-weights; coefficients expected at 0.05 N, as clear clouds find them). Without and with what `SurfaceDistance.expected`
+weights; coefficients expected at 0.05 N, as clear clouds find them). Without and with what `expected_distance`
 takes off: nothing is found there that the true state has not, so a mean other than 0 is bias.
 """
 

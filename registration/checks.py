@@ -1,4 +1,7 @@
-"""Checks of a registration against what its model and its body lead one to expect; `judge` makes all of them.
+"""Checks of a registration against what its model and its body lead one to expect; `judge` makes them.
+
+Three that need a second registration, or another frame, are made elsewhere: forces elsewhere
+(`strategies/elsewhere.py`), the contact (`contact.py`), what was lost (`tracker.py`).
 
 Each is a statistic with a level. Where the law that it has under a right model is known in closed form, its chance is
 given, too. Blocks of parameters and residual terms have checks of their own. A new check is one function here

@@ -313,7 +313,7 @@ class _Search:
                 if not is_handed_on and self._lies_closer(local, loss):
                     continue
                 return refused
-            if is_handed_on and local.was_whole and abs(self.trace[-1].gain - 1.0) < ACCURACY.kept:
+            if is_handed_on and local.is_undamped and abs(self.trace[-1].gain - 1.0) < ACCURACY.kept:
                 return Outcome.CONVERGED
         return Outcome.MAXIMUM_ITERATIONS
 
@@ -382,7 +382,7 @@ class _Search:
             self.limit = _next_limit(self.limit, largest, gain)
             if gain > 0.0:
                 self.evaluation = evaluation
-                if self.options.is_near and local.was_whole and abs(gain - 1.0) < ACCURACY.kept:
+                if self.options.is_near and local.is_undamped and abs(gain - 1.0) < ACCURACY.kept:
                     self._at = local.moved_to(evaluation)
                 self.trace.append(
                     IterationRecord(

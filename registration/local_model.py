@@ -55,7 +55,7 @@ class LocalModel:
     ) -> None:
         self.problem, self.evaluation, self.loss = problem, evaluation, loss
         self.linearised_at = evaluation if linearised_at is None else linearised_at
-        self.was_whole, self.own = True, noise if own is None else own
+        self.is_undamped, self.own = True, noise if own is None else own
         self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
         told = [_told(problem, evaluation, term, loss) for term in problem.terms]
         self._by_terms = np.sum([each[0] for each in told], axis=0) if told else None
@@ -235,7 +235,7 @@ class LocalModel:
     def moved_to(self, evaluation: Evaluation) -> LocalModel:
         """The same about a trial so near that derivatives, hyperparameters and what the points tell are the same."""
         other = copy.copy(self)
-        other.was_whole = True
+        other.is_undamped = True
         for name in ("_whole", "value"):
             other.__dict__.pop(name, None)
         residuals = self.problem.residuals(evaluation, self.own)
@@ -260,7 +260,7 @@ class LocalModel:
         """The best change of the coefficients that moves no observed node further than the limit, metres."""
         change, damping = self._whole, 0.0
         while self.largest_movement(change) > 1.05 * limit or self.problem.is_too_far(change):
-            self.was_whole = False
+            self.is_undamped = False
             damping = max(1.6 * damping, 1e-8 * self._eigen[0][-1], 0.1)
             change = self._damped(damping)
         return change

@@ -1,8 +1,9 @@
-"""Numbers of the registration that are choices: what each means, where it comes from, in two tables.
+"""Numbers of the registration that are choices: what each means, where it comes from, in three tables.
 
 Answers depend on those of `POLICY`: who changes one runs `benchmarks/guards.py` before and after. Those of `ACCURACY`
 say how closely something is computed, or how much of it is looked at: with more of it answers stay what they were, and
-time changes. `benchmarks/policy.py` says of each number what happens at half and at twice its value.
+time changes. `benchmarks/policy.py` says of each of these what happens at half and at twice its value. `RIGID` has
+those of the search for a pose that nobody gave, which `benchmarks/alignment.py` measures as a whole.
 Constants of the literature (Huber's 1.345, the rules of a trust region) stand where they are used, with their source.
 """
 
@@ -259,9 +260,66 @@ class Accuracy:
     drawn: int = count(64, "", "combinations that stand for directions of force that were left out")
     neighbours: int = count(6, "", "of a point, of which it is seen what they share")
     asked: int = count(250, "", "points whose neighbours are looked at")
+    looked_at: int = count(4, "times the points wanted", "points of a large cloud, drawn evenly, that are looked at")
+    counted: int = count(1000, "", "of them, among which the density is counted")
+    dense_within: float = choice(
+        0.05,
+        "of the cloud's extent",
+        "how far it is counted: far more than noise, so that points in front of the surface count as those on it",
+    )
+    sparse: float = choice(
+        0.5,
+        "of the lower quartile of the density",
+        "thinner places are favoured the less, outliers least of all",
+    )
 
 
-POLICY, ACCURACY = Policy(), Accuracy()
+@dataclass(frozen=True)
+class Rigid:
+    """The search for a pose that nobody gave: lengths in sizes of the organ, the diagonal of its bounding box."""
+
+    fewest_points: int = count(20, "", "points of a cloud that a pose is sought for")
+    samples: int = count(6000, "", "of the surface: 3.5 mm apart on a liver, and the planes in them bridge the gaps")
+    neighbours: int = count(12, "", "samples through which each of these planes is laid")
+    cloud_points: int = count(160, "", "of the cloud at the end; more change nothing, the organ's deformation rules")
+    early_points: int = count(80, "", "of the cloud before that")
+    every: int = count(2, "", "of these every so many are tried at the starts")
+    voxels: int = count(56, "", "along the organ's size, by which it is looked up what is near")
+    margin: float = choice(0.2, "sizes of the organ", "of these around it")
+    rotations: int = count(400, "", "spread evenly")
+    patches: int = count(32, "", "of the surface on which the cloud's middle is put")
+    starts: int = count(400, "", "best of both that are brought closer")
+    refined: int = count(40, "", "best of these that are refined")
+    places: int = count(12, "", "of the organ by which two poses are told apart")
+    scales: tuple[float, ...] = field(
+        default=(0.12, 0.10, 0.08, 0.08, 0.06, 0.06, 0.05, 0.05, 0.04, 0.04),
+        metadata={"unit": "sizes of the organ", "meaning": "scales of the robust loss, step by step", "source": ""},
+    )
+    scale: float = choice(
+        0.03, "sizes of the organ", "last of them: a liver moves by 5 to 10 mm at an operation", "alignment"
+    )
+    last_steps: int = count(8, "", "steps with it")
+    sliding: float = choice(0.03, "", "weight of distances along the surface: flat patches do not run away")
+    damping: float = choice(1e-5, "of the trace", "of a step")
+    distinct: float = choice(
+        0.07,
+        "sizes of the organ",
+        "two poses are two where they place it so far apart: 20 mm on a liver",
+        "alignment",
+    )
+    unique: float = choice(
+        1.3, "", "another pose, or a mirror image, must explain the cloud this many times worse", "alignment"
+    )
+    mirrored: float = choice(
+        1.5, "", "a mirror image is named where it explains the cloud this many times better", "alignment"
+    )
+    inliers: float = choice(
+        0.6, "", "share of the points within the last scale, below which nothing matches", "alignment"
+    )
+    floor: float = choice(1e-3, "", "of a misfit: points 1 mm off a liver, which samples cannot tell from none")
+
+
+POLICY, ACCURACY, RIGID = Policy(), Accuracy(), Rigid()
 
 
 @contextmanager

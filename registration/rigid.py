@@ -20,27 +20,12 @@ from scipy.spatial.transform import Rotation
 from softtwin.meshes.body import Surface
 from softtwin.meshes.clouds import CloudError, sample
 
+from .policy import RIGID
 from .pose import Pose
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_FEWEST_POINTS = 20
-_SAMPLES = 6000  # of the surface: 3.5 mm apart on a liver, and the planes in them bridge the gaps
-_CLOUD_POINTS = 160  # of the cloud in the last stage; more change nothing, the organ's deformation rules
-_VOXELS = 56  # along the organ's size, for looking up what is near
-_MARGIN = 0.2
-_ROTATIONS, _PATCHES = 400, 32
-_STARTS, _REFINED = 400, 40
-_SCALES = (0.12, 0.10, 0.08, 0.08, 0.06, 0.06, 0.05, 0.05, 0.04, 0.04)
-_SCALE = 0.03  # a liver moves by 5 to 10 mm at an operation, 3 % of its size
-_TANGENTIAL = 0.03  # weight of sliding: keeps flat patches from running away
-_LAST_STEPS = 8
-_DISTINCT = 0.07  # two poses are two where they place the organ this far apart, 20 mm on a liver
-_UNIQUE = 1.3  # another pose, or a mirror image, must explain the cloud this many times worse than the best
-_MIRRORED = 1.5  # a mirror image is called the reason where it explains the cloud this many times better
-_FEWEST_INLIERS = 0.6  # share of the points within a scale of the surface, below which the cloud shows something else
-_FLOOR = 1e-3  # of a misfit: points 1 mm off a liver, what samples of the surface cannot tell from none
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
@@ -125,8 +110,8 @@ def _checked_cloud(cloud: ArrayLike) -> Floats:
     points = np.asarray(cloud, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise CloudError(f"cloud: expected shape (p, 3), got {points.shape}.")
-    if len(points) < _FEWEST_POINTS:
-        raise CloudError(f"cloud: expected at least {_FEWEST_POINTS} points to find a pose, got {len(points)}.")
+    if len(points) < RIGID.fewest_points:
+        raise CloudError(f"cloud: expected at least {RIGID.fewest_points} points to find a pose, got {len(points)}.")
     if not np.isfinite(points).all():
         raise CloudError("cloud: expected finite coordinates, got NaN or infinity.")
     return points
@@ -134,9 +119,9 @@ def _checked_cloud(cloud: ArrayLike) -> Floats:
 
 def _thinned(points: Floats) -> Floats:
     # A random choice keeps the share of outliers; voxels would keep each of them and thin the rest.
-    if len(points) <= _CLOUD_POINTS:
+    if len(points) <= RIGID.cloud_points:
         return points
-    return points[np.random.default_rng(0).choice(len(points), _CLOUD_POINTS, replace=False)]
+    return points[np.random.default_rng(0).choice(len(points), RIGID.cloud_points, replace=False)]
 
 
 # --- The surface, ready to be asked what is near.
@@ -158,32 +143,32 @@ class _Shape:
 
     def voxels(self, points: Floats) -> Ints:
         """Number of the voxel that holds each point, or of the one at the border next to it."""
-        index = np.clip(np.rint((points - self.low) * _VOXELS), 0, self.counts - 1).astype(np.int32)
+        index = np.clip(np.rint((points - self.low) * RIGID.voxels), 0, self.counts - 1).astype(np.int32)
         return (index[..., 0] * self.counts[1] + index[..., 1]) * self.counts[2] + index[..., 2]
 
 
 def _shape(surface: Surface) -> _Shape:
     corners = surface.points[np.unique(surface.triangles)]
     size, centre = float(np.linalg.norm(np.ptp(corners, axis=0))), corners.mean(axis=0)
-    points = (sample(surface, _SAMPLES, np.random.default_rng(0)) - centre) / size
+    points = (sample(surface, RIGID.samples, np.random.default_rng(0)) - centre) / size
     tree = cKDTree(points)
-    low = points.min(axis=0) - _MARGIN
-    counts = np.ceil((points.max(axis=0) + _MARGIN - low) * _VOXELS).astype(np.int32) + 1
+    low = points.min(axis=0) - RIGID.margin
+    counts = np.ceil((points.max(axis=0) + RIGID.margin - low) * RIGID.voxels).astype(np.int32) + 1
     nearest, distance = _lookup(points, low, counts)
     return _Shape(size, centre, points, _normals(points, tree), tree, low, counts, nearest, distance)
 
 
 def _lookup(points: Floats, low: Floats, counts: Ints) -> tuple[Ints, Floats]:
     holder = np.full(counts, -1, dtype=np.int32)
-    i, j, k = np.rint((points - low) * _VOXELS).astype(np.int32).T
+    i, j, k = np.rint((points - low) * RIGID.voxels).astype(np.int32).T
     holder[i, j, k] = np.arange(len(points))
     distance, index = distance_transform_edt(holder < 0, return_indices=True)
-    return holder[tuple(index)].ravel(), (distance / _VOXELS).astype(np.float32).ravel()
+    return holder[tuple(index)].ravel(), (distance / RIGID.voxels).astype(np.float32).ravel()
 
 
 def _normals(points: Floats, tree: cKDTree) -> Floats:
     # Planes through neighbours rather than triangles: they round off what the mesh's size has made of the organ.
-    _, near = tree.query(points, 12)
+    _, near = tree.query(points, RIGID.neighbours)
     groups = points[near] - points[near].mean(axis=1, keepdims=True)
     return np.linalg.eigh(groups.transpose(0, 2, 1) @ groups)[1][:, :, 0]
 
@@ -218,17 +203,17 @@ class _Found:
 
 
 def _search(shape: _Shape, cloud: Floats) -> _Found:
-    few = cloud[:: max(1, len(cloud) // 80)]
-    motions = _starts(shape, few[::2])
-    for scale in _SCALES:
+    few = cloud[:: max(1, len(cloud) // RIGID.early_points)]
+    motions = _starts(shape, few[:: RIGID.every])
+    for scale in RIGID.scales:
         motions = _step(shape, few, motions, scale, lambda z: shape.nearest[shape.voxels(z)])
-    rough = _misfit(shape.distance[shape.voxels(motions.apply(cloud))], _SCALE)
-    motions = motions.chosen(_distinct(shape, motions, rough, _DISTINCT, _REFINED))
-    for _ in range(_LAST_STEPS):
-        motions = _step(shape, cloud, motions, _SCALE, lambda z: shape.tree.query(z)[1])
+    rough = _misfit(shape.distance[shape.voxels(motions.apply(cloud))], RIGID.scale)
+    motions = motions.chosen(_distinct(shape, motions, rough, RIGID.distinct, RIGID.refined))
+    for _ in range(RIGID.last_steps):
+        motions = _step(shape, cloud, motions, RIGID.scale, lambda z: shape.tree.query(z)[1])
     distances = _distances(shape, motions.apply(cloud))
-    misfits = _misfit(distances, _SCALE)
-    order = _distinct(shape, motions, misfits, _DISTINCT, _REFINED)
+    misfits = _misfit(distances, RIGID.scale)
+    order = _distinct(shape, motions, misfits, RIGID.distinct, RIGID.refined)
     return _Found(motions.chosen(order), misfits[order], distances[order])
 
 
@@ -240,17 +225,17 @@ def _misfit(distances: Floats, scale: float) -> Floats:
 def _distances(shape: _Shape, places: Floats) -> Floats:
     straight, near = shape.tree.query(places)
     planes = np.abs(np.sum((places - shape.points[near]) * shape.normals[near], axis=-1))
-    return np.where(straight < _SCALE, planes, straight)
+    return np.where(straight < RIGID.scale, planes, straight)
 
 
 def _starts(shape: _Shape, cloud: Floats) -> _Motions:
     """The best of rotations spread evenly, each with the cloud's middle on patches spread over the surface."""
     middle = cloud[np.argmin(np.linalg.norm(cloud - np.median(cloud, axis=0), axis=1))]
-    rotations = _spread_rotations(_ROTATIONS)
-    patches = shape.points[_spread_points(shape.points, _PATCHES)]
+    rotations = _spread_rotations(RIGID.rotations)
+    patches = shape.points[_spread_points(shape.points, RIGID.patches)]
     turned = (cloud - middle) @ rotations.transpose(0, 2, 1)
-    misfits = np.array([_misfit(shape.distance[shape.voxels(turned + patch)], _SCALES[-1]) for patch in patches])
-    patch, rotation = np.divmod(np.argsort(misfits, axis=None, kind="stable")[:_STARTS], _ROTATIONS)
+    misfits = np.array([_misfit(shape.distance[shape.voxels(turned + patch)], RIGID.scales[-1]) for patch in patches])
+    patch, rotation = np.divmod(np.argsort(misfits, axis=None, kind="stable")[: RIGID.starts], RIGID.rotations)
     return _Motions(rotations[rotation], patches[patch] - rotations[rotation] @ middle)
 
 
@@ -277,7 +262,7 @@ def _spread_points(points: Floats, count: int) -> Ints:
 def _distinct(shape: _Shape, motions: _Motions, misfits: Floats, apart: float, maximum: int) -> Ints:
     """Numbers of the best motions that place the organ at different places, the best first."""
     order = np.argsort(misfits, kind="stable")
-    seen = motions.back(shape.points[_spread_points(shape.points, 12)])
+    seen = motions.back(shape.points[_spread_points(shape.points, RIGID.places)])
     kept: list[int] = []
     for i in order.tolist():
         if not kept or np.linalg.norm(seen[kept] - seen[i], axis=2).mean(axis=1).min() > apart:
@@ -298,8 +283,8 @@ def _step(shape: _Shape, cloud: Floats, motions: _Motions, scale: float, nearest
     rows = np.concatenate([np.cross(arms, normals), normals], axis=-1)
     matrix = (rows * weights[..., None]).transpose(0, 2, 1) @ rows
     pull = np.sum(rows * (weights * np.sum(offsets * normals, axis=-1))[..., None], axis=1)
-    _add_sliding(matrix, pull, arms, offsets, _TANGENTIAL * weights)
-    matrix += 1e-5 * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+    _add_sliding(matrix, pull, arms, offsets, RIGID.sliding * weights)
+    matrix += RIGID.damping * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(6)
     twists = -np.linalg.solve(matrix, pull[..., None])[..., 0]
     turns = Rotation.from_rotvec(twists[:, :3]).as_matrix()
     moved = np.einsum("kij,kj->ki", turns, motions.shifts - centres) + centres + twists[:, 3:]
@@ -328,7 +313,7 @@ def _judged(shape: _Shape, found: _Found, mirrored: _Found, centre: Floats) -> A
     rival = None if len(others) == 0 else 1 + int(others.argmin())
     against = float(others.min()) if len(others) else np.inf
     mirror = min(_evidence(best, other) for other in mirrored.distances)
-    inside, inside_mirrored = best < _SCALE, mirrored.distances[0] < _SCALE
+    inside, inside_mirrored = best < RIGID.scale, mirrored.distances[0] < RIGID.scale
     return Alignment(
         outcome=_outcome(shape, misfit, inside.mean(), inside_mirrored.mean(), against, mirror),
         pose=_pose(shape, found.motions, 0, centre),
@@ -344,21 +329,21 @@ def _judged(shape: _Shape, found: _Found, mirrored: _Found, centre: Floats) -> A
 def _evidence(best: Floats, other: Floats) -> float:
     """How many times worse another pose explains the points that at least one of the two explains."""
     # A point that neither explains is an outlier to both and says nothing of which one is right.
-    told = (best < _SCALE) | (other < _SCALE)
+    told = (best < RIGID.scale) | (other < RIGID.scale)
     if not told.any():
         return 1.0
-    worse, better = (max(float(_misfit(distances[told], _SCALE)), _FLOOR) for distances in (other, best))
+    worse, better = (max(float(_misfit(distances[told], RIGID.scale)), RIGID.floor) for distances in (other, best))
     return worse / better
 
 
 def _outcome(
     shape: _Shape, misfit: float, inliers: float, mirrored_inliers: float, against: float, mirror: float
 ) -> AlignmentOutcome:
-    if mirrored_inliers >= _FEWEST_INLIERS and mirror * _MIRRORED < 1:
+    if mirrored_inliers >= RIGID.inliers and mirror * RIGID.mirrored < 1:
         return AlignmentOutcome.MIRRORED
-    if inliers < _FEWEST_INLIERS:
+    if inliers < RIGID.inliers:
         return AlignmentOutcome.NO_MATCH
-    if against < _UNIQUE or (mirror < _UNIQUE and not _is_its_own_mirror(shape, misfit)):
+    if against < RIGID.unique or (mirror < RIGID.unique and not _is_its_own_mirror(shape, misfit)):
         return AlignmentOutcome.AMBIGUOUS
     return AlignmentOutcome.FOUND
 

@@ -46,10 +46,6 @@ class Ended:
     prepared: Prepared
     found: SolverResult
 
-    def after(self, before: SolverResult) -> Ended:
-        """The same with what an earlier solver took."""
-        return Ended(self.prepared, after(before, self.found))
-
 
 def after(first: SolverResult, second: SolverResult) -> SolverResult:
     """The second result, with what the first took."""

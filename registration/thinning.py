@@ -6,12 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .policy import ACCURACY
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-_LOOKED_AT = 4  # times as many points as are wanted, drawn evenly, are looked at
-_COUNTED = 1_000  # of them, among which the density is counted
-_NEAR = 0.05  # of the cloud's extent: far more than noise, so that points in front of the surface count as those on it
-_THIN = 0.5  # of the lower quartile of the density: thinner places are favoured the less, outliers least of all
 
 
 def thinned(cloud: Floats, maximum: int) -> Ints:
@@ -34,13 +32,13 @@ def thinned(cloud: Floats, maximum: int) -> Ints:
     if len(cloud) <= maximum:
         return np.arange(len(cloud))
     chance = np.random.default_rng(0)
-    some = chance.permutation(len(cloud))[: _LOOKED_AT * maximum]
+    some = chance.permutation(len(cloud))[: ACCURACY.looked_at * maximum]
     seen = cloud[some]
-    near = _NEAR * float(np.linalg.norm(np.ptp(seen, axis=0)))
-    counts = 1 + cKDTree(seen[:_COUNTED]).query_ball_point(seen, near, return_length=True)
-    minimum = _THIN * np.quantile(counts, 0.25)
+    near = ACCURACY.dense_within * float(np.linalg.norm(np.ptp(seen, axis=0)))
+    counts = 1 + cKDTree(seen[: ACCURACY.counted]).query_ball_point(seen, near, return_length=True)
+    minimum = ACCURACY.sparse * np.quantile(counts, 0.25)
     shares = np.minimum(counts / minimum, minimum / counts)
-    # Every so-manieth share in an order in which neighbours follow each other: as likely, and evenly spread.
+    # Every k-th share in an order in which neighbours follow each other: as likely, and evenly spread.
     order = cKDTree(seen).indices
     ends = np.cumsum(shares[order])
     landmarks = (chance.uniform() + np.arange(maximum)) * ends[-1] / maximum

@@ -62,6 +62,7 @@ class Check:
         p_value: chance under that law of a statistic as far out; None where it is not known.
         subject: which of several it is about, an unknown or a landmark.
         reason: what is wrong and what to do, in a sentence; empty where nothing is.
+        refusal_level: beyond it the result is of no use; None where it is doubtful at worst.
     """
 
     code: Code
@@ -74,6 +75,7 @@ class Check:
     p_value: float | None = None
     subject: str = ""
     reason: str = ""
+    refusal_level: float | None = None
 
     @property
     def is_passed(self) -> bool:
@@ -162,7 +164,8 @@ def checked(
         verdict = Verdict.REFUSED if refused is not None and sign * statistic > sign * refused else Verdict.DOUBTFUL
     reason = "" if verdict is Verdict.ACCEPTED else reason
     name, chance = law or ("", None)
-    return Check(code, verdict, float(statistic), float(level), unit, is_minimum, name, chance, subject, reason)
+    beyond = None if refused is None else float(refused)
+    return Check(code, verdict, float(statistic), float(level), unit, is_minimum, name, chance, subject, reason, beyond)
 
 
 def largest_normal(value: float, count: int) -> tuple[str, float]:
