@@ -278,7 +278,7 @@ class Accuracy:
 class Rigid:
     """The search for a pose that nobody gave: lengths in sizes of the organ, the diagonal of its bounding box."""
 
-    fewest_points: int = count(20, "", "points of a cloud that a pose is sought for")
+    minimum_points: int = count(20, "", "points of a cloud that a pose is sought for")
     samples: int = count(6000, "", "of the surface: 3.5 mm apart on a liver, and the planes in them bridge the gaps")
     neighbours: int = count(12, "", "samples through which each of these planes is laid")
     cloud_points: int = count(160, "", "of the cloud at the end; more change nothing, the organ's deformation rules")

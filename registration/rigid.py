@@ -110,8 +110,8 @@ def _checked_cloud(cloud: ArrayLike) -> Floats:
     points = np.asarray(cloud, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise CloudError(f"cloud: expected shape (p, 3), got {points.shape}.")
-    if len(points) < RIGID.fewest_points:
-        raise CloudError(f"cloud: expected at least {RIGID.fewest_points} points to find a pose, got {len(points)}.")
+    if len(points) < RIGID.minimum_points:
+        raise CloudError(f"cloud: expected at least {RIGID.minimum_points} points to find a pose, got {len(points)}.")
     if not np.isfinite(points).all():
         raise CloudError("cloud: expected finite coordinates, got NaN or infinity.")
     return points
