@@ -15,6 +15,7 @@ import json
 import re
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import cache
@@ -172,8 +173,12 @@ def choices() -> str:
 
 def _of(record: dict[str, Any]) -> str:
     """Where the last two columns come from."""
-    clouds = max(row["clouds"] for row in record["figures"].values())
-    return f"The last two columns: {clouds} clouds, code of commit {record['commit']}, {record['date']}."
+    told = {each.name for kind in (POLICY, ACCURACY) for each in fields(kind)}
+    figures = {name: row for name, row in record["figures"].items() if name in told}
+    clouds = max(row["clouds"] for row in figures.values())
+    rows = Counter((record["made"][name]["commit"], record["made"][name]["date"]) for name in figures)
+    of = "; ".join(f"{count} rows of commit {commit}, {date}" for (commit, date), count in rows.most_common())
+    return f"The last two columns: {clouds} clouds; {of}."
 
 
 def _changed(row: dict[str, Any] | None, value: float, factor: str) -> str:
