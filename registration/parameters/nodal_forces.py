@@ -18,7 +18,7 @@ from ..evaluation import Evaluation, Slopes
 from ..forward import ReducedModel
 from ..hyperparameters import FORCE as SCALE
 from ..hyperparameters import LogNormalPrior
-from ..policy import ACCURACY
+from ..policy import ACCURACY, POLICY
 from ..surface_distance import SurfaceDistance
 from .block import ParameterBlock
 
@@ -200,7 +200,7 @@ class LikelihoodInformed:
         maximum: most directions kept.
     """
 
-    noise: float = 1e-4
+    noise: float = field(default_factory=lambda: POLICY.noise_minimum)
     points: int = 500
     size: float = field(default_factory=lambda: ACCURACY.force_size_maximum)
     information: float = 0.5

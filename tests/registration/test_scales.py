@@ -89,6 +89,20 @@ def test_what_is_left_out_keeps_its_variance(body: Body) -> None:
     assert three.size == 3
 
 
+@pytest.mark.parametrize("stiffer", [1e-4, 1e4])
+def test_an_organ_of_any_stiffness_keeps_the_same_directions(body: Body, stiffer: float) -> None:
+    """The forces that are expected grow with the stiffness: what a cloud can tell stays what it was."""
+    observed = SurfaceDistance(body, body.surfaces["observed"])
+
+    def directions(stiffness: float) -> int:
+        every = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.003 * stiffness, 1.0))
+        softer = replace(every, patterns=every.patterns / stiffness)  # as far moved by forces that are so much larger
+        model = reduce_model(Cantilever(body), observed.nodes, softer.basis)
+        return Prepared(every, model).informed(observed, LikelihoodInformed()).forces.size
+
+    assert directions(stiffer) == directions(1.0) == 3
+
+
 def problem(body: Body, rng: np.random.Generator, **given: Any) -> Problem:
     """Of a cloud with a millimetre of noise, in which neighbours share none; what is given is otherwise."""
     observed = given.pop("observed", SurfaceDistance(body, body.surfaces["observed"]))

@@ -12,7 +12,7 @@ from softtwin.registration.options import expected_force
 from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.registration.surface_distance import SurfaceDistance
-from softtwin.registration.verdict import Verdict
+from softtwin.registration.verdict import Code, Verdict, checked
 
 from .conftest import Cantilever, cloud_on, tip_forces
 
@@ -34,6 +34,12 @@ def refused(registrar: Registrar, cloud: np.ndarray, reason: str) -> None:
     judged = registrar.register(cloud).judgement
     assert judged.verdict is not Verdict.ACCEPTED
     assert any(reason in each for each in judged.reasons), judged.reasons
+
+
+def test_a_record_says_where_refusal_begins() -> None:
+    odd = checked(Code.MISFIT, 2.0, 1.0, "odd", refused=1.5)
+    assert odd.verdict is Verdict.REFUSED and odd.figures()["refusal_level"] == 1.5
+    assert "refusal_level" not in checked(Code.OUTLIERS, 2.0, 1.0, "odd").figures()
 
 
 def test_a_line_is_refused(registrar: Registrar) -> None:
