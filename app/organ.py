@@ -24,7 +24,7 @@ from softtwin.meshes.attachment import (
     turned,
 )
 from softtwin.meshes.body import Body, BodyError, Surface
-from softtwin.meshes.components import check_component
+from softtwin.meshes.components import ComponentError, Structures, check_component, component_of_cells
 from softtwin.meshes.embedding import embed, is_carried_along
 from softtwin.meshes.grid import gridded
 from softtwin.meshes.io import (
@@ -255,18 +255,36 @@ def _solid(section: BodySection, reader: _Reader, source: File) -> tuple[Volume,
         found, said = read_mesh(*reader.options(source)), []
     size = float(np.ptp(found.points, axis=0).max())
     _check_size(reader.root / source.path, size, source.unit or section.unit)
+
+    def structures(name: str) -> Floats:
+        if name not in section.inner:
+            named = ", ".join(sorted(section.inner)) or "none"
+            raise ComponentError(f"--component near:{name}: expected an inner structure, one of {named}.")
+        return _inner(name, section.inner[name], reader)[0].points
+
     if not isinstance(found, Surface):
-        return found, list(found.said)
+        return _one_component(found, section.component, structures)
     if reader.scan is not None:
         reader.scan.check_touching(found, section.cell_size or _LONG * float(np.cbrt(found.volume / section.nodes)))
     # What a segmentation has of components and holes was chosen among its voxels.
-    options: dict[str, Any] = {"cavities": section.cavities, "component": section.component} if not reader.scan else {}
+    options: dict[str, Any] = {}
+    if reader.scan is None:
+        options = {"cavities": section.cavities, "component": section.component, "structures": structures}
     if section.cell_size > 0.0:
         solid = solidify(found, cell_size=section.cell_size, **options)
     else:
         solid = solidify(found, node_count=section.nodes, **options)
     made = Volume(solid.points, solid.cells, np.arange(len(solid.points)))
     return made, said + str(solid.mending).splitlines()
+
+
+def _one_component(volume: Volume, component: str, structures: Structures) -> tuple[Volume, list[str]]:
+    """The component of a volume mesh that is asked for; nothing is left out that nobody has asked to leave out."""
+    if component.strip() == "largest":  # said or not: cells of a file are never lost for a default
+        return volume, list(volume.said)
+    nodes, cells, said = component_of_cells(volume.points, volume.cells, component, structures)
+    found = Volume(volume.points[nodes], cells, volume.numbers[nodes])
+    return found, [*volume.said, *([said] if said else [])]
 
 
 def _check_size(path: Path, size: float, unit: Unit) -> None:

@@ -239,7 +239,8 @@ def force(body: Body, count: int) -> dict[str, Any]:
                 solved = ended.evaluations
                 if ended.evaluation.match.rms > _LEFT:  # as `Registrar.follow` does where a start leads astray
                     smooth = nodal_forces(body, support, unknown.scale, SMOOTH)
-                    first = replace(search, model=reduce_model(model, observed.nodes, smooth.basis), forces=smooth)
+                    slow = reduce_model(model, observed.nodes, smooth.basis)
+                    first = Search.of(slow, observed, cloud, noise_prior(), (smooth,))
                     rough = GaussNewton().solve(first, np.zeros(smooth.size))
                     begun = smooth.forces(rough.evaluation.coefficients)[unknown.nodes].ravel()
                     again = GaussNewton().solve(search, begun)

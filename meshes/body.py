@@ -404,5 +404,5 @@ def _check_cells(points: Floats, cells: Ints, kind: Kind) -> None:
         sizes = np.sort(np.bincount(labels))[::-1]
         raise BodyError(
             f"Body.cells: expected one connected component, got {count} with {sizes[:5].tolist()} nodes; "
-            "keep the largest or build one body each."
+            "keep one (of a file: --component 1 is the largest) or build one body each."
         )

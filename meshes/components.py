@@ -6,10 +6,15 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from .body import Floats
+from .body import Floats, Ints
+from .metrics import cell_volumes
 
 Cavities = Literal["", "keep", "fill"]
+Structures = Callable[[str], Floats]  # the vertices of a structure by its name, (v, 3), metres
 # A hole of a segmentation that is smaller than either is noise of the segmentation, and is filled: voxels that were
 # missed, small vessels without a label. The lumen of a bladder, a stomach or a heart is a tenth of its wall or more. No
 # label map at hand has a natural hole between the two (those of lungs in shared/data have none), so this is a choice.
@@ -85,3 +90,41 @@ def dropped_line(dropped: float, kept: float, component: str) -> str:
     if dropped <= LARGE_SHARE * (dropped + kept):
         return f"segmentation: {line}"
     return f"warning: {line}; --component left, right, 2 or near:STRUCTURE takes another one"
+
+
+def component_of_cells(points: Floats, cells: Ints, component: str, structures: Structures) -> tuple[Ints, Ints, str]:
+    """One of several components of a volume mesh: its nodes, (n,), its cells by these, (m, k), and what to say of it.
+
+    Of a mesh of one component nothing is said.
+
+    Args:
+        points: node positions, (n, 3), LPS, metres.
+        cells: node numbers, (m, k), of any kind.
+        component: see `check_component`.
+        structures: vertices of the structures that `near:` may name.
+
+    Raises:
+        ComponentError: there is no such component.
+    """
+    pairs = np.repeat(cells[:, 0], cells.shape[1]), cells.ravel()
+    graph = coo_array((np.ones(cells.size), pairs), shape=(len(points), len(points)))
+    count, labels = connected_components(graph, directed=False)
+
+    def away(name: str) -> Floats:
+        vertices = structures(name)
+        return np.array([cKDTree(points[labels == one]).query(vertices)[0].min() for one in range(count)])
+
+    volumes = cell_volumes(points, cells[:, : 4 if cells.shape[1] in (4, 10) else 8])  # of curved cells nearly
+    sizes = np.bincount(labels[cells[:, 0]], volumes, count)
+    middles = np.array([points[labels == one].mean(axis=0) for one in range(count)])
+    chosen = chosen_component(component, sizes, middles, away, "the mesh")
+    nodes, kept = np.flatnonzero(labels == chosen), labels[cells[:, 0]] == chosen
+    said = (
+        ""
+        if count == 1
+        else (
+            f"component: {component}, {1e6 * sizes[chosen]:.4g} ml, was kept; "
+            f"{1e6 * (sizes.sum() - sizes[chosen]):.4g} ml in {count - 1} others left out, as you say"
+        )
+    )
+    return nodes, np.searchsorted(nodes, cells[kept]), said

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -14,9 +14,9 @@ from vtkmodules.vtkFiltersCore import vtkQuadricDecimation
 from .body import Floats, Ints, Surface
 from .checks import Defects, SurfaceError, compacted, merged, piece_numbers, put_in_order
 from .closest import distances, polydata
-from .components import Cavities, ComponentError, chosen_component
+from .components import Cavities, ComponentError, Structures, chosen_component
 from .metrics import cell_volumes, tetrahedron_quality
-from .nesting import nesting
+from .nesting import nesting, winding_numbers
 from .smoothing import Flags, improved, outer_faces, used_points
 from .tetwild import tetrahedra
 
@@ -37,6 +37,7 @@ _SEARCHES = 5
 _COUNT_TOLERANCE = 0.15
 _SLOPE = 2.2  # nodes fall with this power of the cell size: 3 inside, 2 on the surface, less where details bind
 _UNPINCHES = 20
+_PROBES, _INSIDE = 7, 0.5  # vertices of a structure that are asked, and the winding number above which one is inside
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class Mending:
         volume_after: of the solid, cubic metres.
         distance: largest distance between the surface (holes closed) and the solid's boundary, either way, metres.
         mean_distance: mean of both ways, metres.
+        others: volumes of the components beside the one that was asked for, largest first, cubic metres.
     """
 
     defects: Defects
@@ -58,6 +60,7 @@ class Mending:
     volume_after: float
     distance: float
     mean_distance: float
+    others: tuple[float, ...] = ()
 
     def __str__(self) -> str:
         d = self.defects
@@ -75,7 +78,10 @@ class Mending:
             ),
             (len(self.dropped), f"{len(self.dropped)} components left out, the largest {_millilitres(self.dropped)}"),
         ]
-        lines = [line for holds, line in said if holds] or ["nothing was wrong with the surface"]
+        lines = [line for holds, line in said if holds]
+        if self.others:
+            lines.append(f"{1e6 * sum(self.others):.4g} ml in {len(self.others)} other components left out, as you say")
+        lines = lines or ["nothing was wrong with the surface"]
         share = (self.volume_after + sum(self.dropped)) / self.volume_before
         lines += [
             f"volume before {1e6 * self.volume_before:.5g} ml, after {1e6 * self.volume_after:.5g} ml"
@@ -93,7 +99,7 @@ class Mending:
         if lost > _LARGE_PART:
             lines.append(
                 f"warning: {100 * lost:.0f} % of the surface's volume is in components that were left out; "
-                "--component left, right or 2 takes another one"
+                "--component left, right, 2 or near:STRUCTURE takes another one"
             )
         return "\n".join(lines)
 
@@ -119,6 +125,7 @@ def solidify(
     node_count: int | None = None,
     cavities: Cavities = "",
     component: str = "largest",
+    structures: Structures | None = None,
 ) -> Solid:
     """Tetrahedra that fill what a surface encloses, whatever its defects: holes, crumbs, overlaps, any winding.
 
@@ -130,8 +137,8 @@ def solidify(
         node_count: wanted number of nodes; the edge length is searched until the number is met within 15 %, with
             at most 5 meshes (the number reached is the length of the points returned, and is logged).
         cavities: fill closed components inside others, or keep them as cavities, as is done where nothing is said.
-        component: `largest`, or which of several that lie apart is meant (see `components.check_component`; near: has
-            no meaning here).
+        component: `largest`, or which of several that lie apart is meant (see `components.check_component`).
+        structures: vertices of the structures that `near:` may name.
 
     Raises:
         SurfaceError: no solid came, or only one with slivers.
@@ -139,7 +146,8 @@ def solidify(
             `MAXIMUM_NODES`.
     """
     _check_wish(cell_size, node_count)
-    ordered, defects = put_in_order(_component(surface, component), cavities)
+    chosen, others = _component(surface, component, structures or _no_structure)
+    ordered, defects = put_in_order(chosen, cavities)
     if not ordered.volume > 0:
         raise SurfaceError(
             "surface: expected triangles that enclose a volume, got none; is it a sheet, or open on one side?"
@@ -156,13 +164,13 @@ def solidify(
             f"surface: expected tetrahedra with a radius ratio of at least {_LOWEST_QUALITY:g}, the worst has "
             f"{worst:.2g}; try another number of nodes or cell size."
         )
-    return Solid(points, cells, _mending(ordered, defects, points, cells))
+    return Solid(points, cells, replace(_mending(ordered, defects, points, cells), others=others))
 
 
-def _component(surface: Surface, component: str) -> Surface:
-    """The component that words mean, with what lies inside it."""
+def _component(surface: Surface, component: str, structures: Structures) -> tuple[Surface, tuple[float, ...]]:
+    """The component that words mean, with what lies inside it, and the volumes of the others, cubic metres."""
     if component.strip() == "largest":
-        return surface
+        return surface, ()
     whole = compacted(merged(surface))
     vertices = piece_numbers(whole)
     pieces = vertices[whole.triangles[:, 0]]
@@ -170,13 +178,27 @@ def _component(surface: Surface, component: str) -> Surface:
     found = nesting(whole, pieces, np.ones(count, dtype=np.bool_))
     tops = np.flatnonzero(found.depths == 0)
     middles = np.array([whole.points[vertices == top].mean(axis=0) for top in tops])
-    chosen = tops[chosen_component(component, found.volumes[tops], middles, _no_structure, "the surface")]
+
+    def away(name: str) -> Floats:
+        vertices = structures(name)
+        return np.array([_away(whole, whole.triangles[pieces == top], vertices) for top in tops])
+
+    chosen = tops[chosen_component(component, found.volumes[tops], middles, away, "the surface")]
     inside = [k for k in range(count) if k == chosen or (found.depths[k] > 0 and found.holders[k] == chosen)]
-    return compacted(Surface(whole.points, whole.triangles[np.isin(pieces, inside)]))
+    others = np.sort(found.volumes[tops[tops != chosen]])[::-1]
+    return compacted(Surface(whole.points, whole.triangles[np.isin(pieces, inside)])), tuple(others.tolist())
+
+
+def _away(surface: Surface, triangles: Ints, vertices: Floats) -> float:
+    """How far a structure is from what some triangles enclose, metres: 0 where a part of it is inside."""
+    probes = vertices[np.linspace(0, len(vertices) - 1, min(_PROBES, len(vertices))).astype(int)]
+    if (winding_numbers(surface, triangles, probes) > _INSIDE).any():
+        return 0.0
+    return float(distances(Surface(surface.points, triangles), vertices).min())
 
 
 def _no_structure(name: str) -> Floats:
-    raise ComponentError(f"--component near:{name}: expected a segmentation as source; a surface knows no labels.")
+    raise ComponentError(f"--component near:{name}: expected the name of an inner structure; none is known.")
 
 
 def check_node_count(surface: Surface, cell_size: float) -> None:

@@ -18,6 +18,7 @@ from softtwin.app.config import BodySection, Config, ConfigError, files_axes, pa
 from softtwin.app.organ import make_organ
 from softtwin.meshes.attachment import RegionError
 from softtwin.meshes.body import Body, BodyError, Surface
+from softtwin.meshes.components import ComponentError
 from softtwin.meshes.export import Coordinates, write_surface
 from softtwin.meshes.io import FileError, UnitWarning, read_surface
 from softtwin.meshes.shapes import beam, liver_phantom
@@ -204,6 +205,32 @@ def test_a_unit_that_is_said_wins_over_the_one_that_a_mesh_states(
     body = {"source": seen[0].body.source, "unit": "mm", "nodes": 300, "fixed": "halfspace:0,0,0:0,0,-1"}
     notes = make_organ(parse_config({"body": body}).body, tmp_path).notes
     assert f"warning: {tmp_path / 'organ.ply'} states that it is in m; mm was taken, as you say" in notes
+
+
+@pytest.mark.parametrize("component, wanted", [("near:tumour", 1), ("1", 0), ("left", 1), ("near:vein", None)])
+def test_one_of_two_organs_in_a_mesh_is_chosen(
+    phantom: Body, tmp_path: Path, component: str, wanted: int | None
+) -> None:
+    one = beam((6, 2, 2), (0.06, 0.02, 0.02), "tetrahedron")
+    points = np.concatenate([1.2 * one.points, one.points + np.array([0.1, 0.0, 0.0])])
+    mesh = meshio.Mesh(1e3 * points, [("tetra", np.concatenate([one.cells, one.cells + len(one.points)]))])
+    mesh.write(tmp_path / "kidneys.vtk")
+    tumour = phantom.inner["tumour"]
+    middle = tumour.points.mean(axis=0)
+    inside = 1e3 * (0.5 * (tumour.points - middle) + points[len(one.points) :].mean(axis=0))
+    meshio.Mesh(inside, [("triangle", tumour.triangles)]).write(tmp_path / "tumour.ply")
+    body = {"source": "kidneys.vtk", "unit": "mm", "fixed": "halfspace:0,0,5:0,0,-1"}
+    body |= {"component": component} | ({"inner": {"tumour": "tumour.ply"}} if component.startswith("near") else {})
+    if wanted is None:
+        with pytest.raises(ComponentError, match=r"--component near:vein: expected an inner structure, one of tumour"):
+            make_organ(parse_config({"body": body}).body, tmp_path)
+        return
+    organ = make_organ(parse_config({"body": body}).body, tmp_path)
+    assert organ.body.volume == pytest.approx((1.2**3, 1.0)[wanted] * one.volume, rel=1e-9)
+    assert any("in 1 others left out, as you say" in note for note in organ.notes)
+    body["component"] = "largest"  # as where nothing is said: no cell of a file is lost for a default
+    with pytest.raises(BodyError, match=r"expected one connected component, got 2 .* --component 1"):
+        make_organ(parse_config({"body": body}).body, tmp_path)
 
 
 def test_an_inner_surface_outside_the_organ_is_refused_and_a_part_outside_is_said(files: Path, tmp_path: Path) -> None:

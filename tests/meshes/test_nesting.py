@@ -9,8 +9,9 @@ import pytest
 
 from softtwin.meshes.body import Surface
 from softtwin.meshes.checks import SurfaceError, put_in_order
-from softtwin.meshes.components import ComponentError, check_component
+from softtwin.meshes.components import ComponentError, check_component, component_of_cells
 from softtwin.meshes.nesting import winding_numbers
+from softtwin.meshes.shapes import beam
 from softtwin.meshes.solidify import _component, solidify
 
 
@@ -81,15 +82,54 @@ def test_a_component_is_chosen_with_its_cavity() -> None:
     both = together(left, right, ball(0.02, (0.1, 0.0, 0.0), inward=True))
     for component, wanted in (("left", left.volume + ball(0.02, inward=True).volume), ("right", right.volume),
                               ("2", left.volume + ball(0.02, inward=True).volume), ("largest", None)):  # fmt: skip
-        chosen = _component(both, component)
+        chosen, others = _component(both, component, none_known)
         if wanted is not None:
-            assert put_in_order(chosen)[0].volume == pytest.approx(wanted, rel=1e-9)
+            assert put_in_order(chosen)[0].volume == pytest.approx(wanted, rel=1e-9) and len(others) == 1
     with pytest.raises(ComponentError, match="has 2 components, got 3"):
-        _component(both, "3")
-    with pytest.raises(ComponentError, match="a surface knows no labels"):
-        _component(both, "near:tumour")
+        _component(both, "3", none_known)
     with pytest.raises(ComponentError, match="one component that is no crumb"):
-        _component(left, "left")
+        _component(left, "left", none_known)
+
+
+def none_known(name: str) -> np.ndarray:
+    raise ComponentError(f"no structure {name}")
+
+
+@pytest.mark.parametrize("kind", ["surface", "cells"])
+@pytest.mark.parametrize("middle, wanted", [((0.1, 0.0, 0.0), 0), ((-0.1, 0.0, 0.02), 1), ((-0.03, 0.0, 0.0), 1)])
+def test_a_component_is_chosen_by_the_structure_in_it(kind: str, middle: tuple[float, float, float],
+                                                      wanted: int) -> None:  # fmt: skip
+    """Inside one of two, or nearer to one of them; the middle of a large one is farther from its surface."""
+    tumour = ball(0.004, middle)
+    structures = {"tumour": tumour.points}.__getitem__
+    if kind == "surface":
+        balls = ball(0.05, (0.1, 0.0, 0.0)), ball(0.06, (-0.1, 0.0, 0.0))
+        chosen, others = _component(together(*balls), "near:tumour", structures)
+        assert chosen.volume == pytest.approx(balls[wanted].volume, rel=1e-9)
+        assert others == pytest.approx([balls[1 - wanted].volume], rel=1e-9)
+    else:
+        one = beam((6, 2, 2), (0.1, 0.1, 0.1), "tetrahedron")
+        centred = one.points - 0.05
+        places = centred + np.array([0.1, 0.0, 0.0]), 1.1 * centred - np.array([0.1, 0.0, 0.0])
+        points, cells = np.concatenate(places), np.concatenate([one.cells, one.cells + len(one.points)])
+        nodes, kept, said = component_of_cells(points, cells, "near:tumour", structures)
+        np.testing.assert_array_equal(points[nodes], places[wanted])
+        np.testing.assert_array_equal(kept, one.cells)
+        left_out = 1e3 * (1.1**3, 1.0)[wanted]
+        assert f"{left_out:.4g} ml in 1 others left out" in said
+
+
+@pytest.mark.parametrize("shape", ["tetrahedron", "hexahedron"])
+def test_the_largest_component_of_cells_is_that_of_most_volume(shape: str) -> None:
+    fine, coarse = beam((6, 2, 2), (0.1, 0.1, 0.1), shape), beam((3, 2, 2), (0.2, 0.1, 0.1), shape)
+    points = np.concatenate([fine.points, coarse.points + np.array([1.0, 0.0, 0.0])])
+    cells = np.concatenate([fine.cells, coarse.cells + len(fine.points)])
+    nodes, kept, _ = component_of_cells(points, cells, "1", none_known)
+    assert nodes[0] == len(fine.points) and len(kept) == len(coarse.cells)
+    nodes, kept, said = component_of_cells(fine.points, fine.cells, "1", none_known)
+    assert len(nodes) == len(fine.points) and len(kept) == len(fine.cells) and said == ""
+    with pytest.raises(ComponentError, match="the mesh has 1 components, got 2"):
+        component_of_cells(fine.points, fine.cells, "2", none_known)
 
 
 @pytest.mark.parametrize("words", ["", "0", "-1", "near:", "top", "1.5"])
