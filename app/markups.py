@@ -41,7 +41,7 @@ class Target:
         label: its name; no two are alike.
         position: (3,), metres, in the coordinates of the body at rest.
         margin: distance within which it lies with 95 % in these coordinates, metres; of a centre, the largest on its
-            structure.
+            structure, of the part inside the organ.
         remark: of what, and what else there is to say.
     """
 
@@ -60,7 +60,8 @@ class Target:
 def targets_of(twin: Twin, result: Registration, surface_points: int = 0) -> list[Target]:
     """The centre of each inner structure, and points spread over its surface, as a registration has found them.
 
-    Each says so where the frame is not accepted.
+    Each says so where the frame is not accepted, and where a part of the structure lies outside the organ: of that
+    nothing is known, and no point stands for it.
 
     Args:
         twin: the twin.
@@ -70,29 +71,38 @@ def targets_of(twin: Twin, result: Registration, surface_points: int = 0) -> lis
     return [
         target
         for name, surface in twin.body.inner.items()
-        for target in _points_of(name, surface, twin.embeddings[name], result, surface_points)
+        for target in _points_of(twin, name, surface, result, surface_points)
     ]
 
 
-def _points_of(name: str, rest: Surface, carried: Embedding, result: Registration, count: int) -> Iterator[Target]:
+def _points_of(twin: Twin, name: str, rest: Surface, result: Registration, count: int) -> Iterator[Target]:
+    carried, outside = twin.embeddings[name], twin.outside[name]
     known, moved = result.uncertainty, rest.points + carried.displace(result.displacement)
     margins = known.margin(carried, _CONFIDENCE)
-    weights = _shares(rest)
+    inside = Surface(rest.points, rest.triangles[~outside[rest.triangles].any(axis=1)])
+    tracked = inside if len(inside.triangles) else rest
+    weights = _shares(tracked)
     own = float(known.margin(_mean(carried, weights), _CONFIDENCE)[0])
     verdict, doubts = result.judgement.verdict, result.judgement.reasons
     warning = "" if verdict is Verdict.ACCEPTED else f"; FRAME {verdict.value.upper()}: {'; '.join(doubts)}"
     alone = f"; {1e3 * own:.1f} mm for its centre alone" if math.isfinite(own) else ""
-    alone += _of_camera(result, carried)
-    yield Target(name, weights @ moved, float(margins.max()), f"for each point of {name}{alone}{warning}")
-    for number, vertex in enumerate(_spread(rest, count), 1):
+    alone += _of_camera(twin, name, result)
+    if outside.any():
+        alone += (
+            f"; {100 * outside.mean():.0f} % of it lies outside the organ and is carried along: NOT KNOWN, left out"
+        )
+    largest = twin.margin_inside(name, margins)
+    yield Target(name, weights @ moved, largest, f"for each point of {name}{alone}{warning}")
+    for number, vertex in enumerate(_spread(rest, ~outside, count), 1):
         yield Target(f"{name} {number}", moved[vertex], float(margins[vertex]), f"for this point of {name}{warning}")
 
 
-def _of_camera(result: Registration, carried: Embedding) -> str:
+def _of_camera(twin: Twin, name: str, result: Registration) -> str:
     """What is known of a structure where the camera sees it, in words; none where its coordinates are no others."""
     if not result.has_free_pose:
         return ""
-    margin = float(result.camera_uncertainty.margin(carried, _CONFIDENCE).max())
+    margins = result.camera_uncertainty.margin(twin.embeddings[name], _CONFIDENCE)
+    margin = twin.margin_inside(name, margins)
     return f"; {1e3 * margin:.1f} mm in the camera's coordinates" if math.isfinite(margin) else ""
 
 
@@ -111,9 +121,10 @@ def _mean(points: Embedding, weights: Floats) -> Embedding:
     return Embedding(points.cells[:1], nodes[None], row[nodes][None], np.zeros(1), points.node_count)
 
 
-def _spread(surface: Surface, count: int) -> list[int]:
-    """Vertices in use, each the farthest from those before it."""
+def _spread(surface: Surface, allowed: NDArray[np.bool_], count: int) -> list[int]:
+    """Vertices in use that may be taken, each the farthest from those before it."""
     used = np.unique(surface.triangles)
+    used = used[allowed[used]]
     chosen, far = list[int](), np.full(len(used), np.inf)
     for _ in range(min(count, len(used))):
         chosen.append(int(np.argmax(far)))

@@ -260,6 +260,8 @@ def figures_of(twin: Twin, answer: Answer, place: Coordinates, row: Mapping[str,
     figures["margin95_mm"] = _margins(twin, found.uncertainty, row, "margin95_m")
     if found.has_free_pose:
         figures["camera_margin95_mm"] = _margins(twin, found.camera_uncertainty, row, "camera_margin95_m")
+    if any(outside.any() for outside in twin.outside.values()):
+        figures["outside_share"] = {name: float(outside.mean()) for name, outside in twin.outside.items()}
     return figures | {
         "net_force_N": place.directions(found.net_force).tolist(),
         "net_force_deviation_N": found.net_force_deviation.tolist(),
@@ -271,10 +273,13 @@ def figures_of(twin: Twin, answer: Answer, place: Coordinates, row: Mapping[str,
 
 
 def _margins(twin: Twin, known: Uncertainty, row: Mapping[str, Any] | None, entry: str) -> dict[str, float]:
-    """The largest 95 % margin of each structure, millimetres; those of inner ones from the record's row, if given."""
+    """The largest 95 % margin of each structure, of inner ones inside the organ, millimetres.
+
+    Those of inner ones are from the record's row, if given.
+    """
     every = {twin.organ: float(known.margin().max())}
     if row is None:
-        every |= {name: float(known.margin(points).max()) for name, points in twin.embeddings.items()}
+        every |= {name: twin.margin_inside(name, known.margin(points)) for name, points in twin.embeddings.items()}
     else:
         every |= {name: target[entry] for name, target in row["targets"].items()}
     return {name: 1e3 * margin for name, margin in every.items()}

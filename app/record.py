@@ -218,10 +218,10 @@ def frame_figures(twin: Twin, result: Registration, truth: Floats | None) -> dic
     row["deviation_m"] = {"mean": float(known.deviation.mean()), "largest": float(known.deviation.max())}
     row["targets"] = {name: {"movement_m": _mean_length(vectors)} for name, vectors in moved.items()}
     for name, target in row["targets"].items():
-        target["margin95_m"] = _largest(known.margin(twin.embeddings[name]), twin.outside[name])
+        target["margin95_m"] = twin.margin_inside(name, known.margin(twin.embeddings[name]))
         if result.has_free_pose:
             margins = result.camera_uncertainty.margin(twin.embeddings[name])
-            target["camera_margin95_m"] = _largest(margins, twin.outside[name])
+            target["camera_margin95_m"] = twin.margin_inside(name, margins)
         if twin.outside[name].any():
             target["outside_share"] = float(twin.outside[name].mean())
     if truth is not None:
@@ -315,11 +315,6 @@ def describe(row: Mapping[str, Any]) -> str:
         line += "" if share is None else f" where it is inside the organ ({100 * share:.0f} % is not, and not known)"
         line += f" ({millimetres(target['error_m'])} off)" if "error_m" in target else ""
     return line
-
-
-def _largest(margins: Floats, outside: NDArray[np.bool_]) -> float:
-    """The largest margin of what lies inside the organ: of the rest nothing is known."""
-    return float(margins[~outside].max(initial=0.0)) if not outside.all() else math.inf
 
 
 def describe_estimate(estimate: Mapping[str, Any]) -> str:

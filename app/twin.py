@@ -365,6 +365,16 @@ class Twin:
         """Which vertices of each inner surface lie outside the organ, and are carried along, by name."""
         return {name: is_carried_along(self.body, points) for name, points in self.embeddings.items()}
 
+    def margin_inside(self, name: str, margins: NDArray[np.float64]) -> float:
+        """The largest margin of what lies inside the organ of an inner surface, metres: of the rest nothing is known.
+
+        Args:
+            name: of the surface.
+            margins: of its vertices, (v,), metres.
+        """
+        inside = margins[~self.outside[name]]
+        return float(inside.max()) if len(inside) else np.inf
+
     def aligned(self, cloud: ArrayLike) -> PosePrior:
         """An unknown pose about the one that a cloud alone shows.
 

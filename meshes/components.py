@@ -115,7 +115,7 @@ def component_of_cells(points: Floats, cells: Ints, component: str, structures: 
         return np.array([cKDTree(points[labels == one]).query(vertices)[0].min() for one in range(count)])
 
     volumes = cell_volumes(points, cells[:, : 4 if cells.shape[1] in (4, 10) else 8])  # of curved cells nearly
-    sizes = np.bincount(labels[cells[:, 0]], volumes, count)
+    sizes = np.bincount(labels[cells[:, 0]], volumes, count).astype(np.float64)
     middles = np.array([points[labels == one].mean(axis=0) for one in range(count)])
     chosen = chosen_component(component, sizes, middles, away, "the mesh")
     nodes, kept = np.flatnonzero(labels == chosen), labels[cells[:, 0]] == chosen

@@ -26,8 +26,9 @@ class Figures:
         title: what is shown.
         verdict: of it; None where there is none yet.
         reason: why it is not accepted, or what is waited for.
-        margins: 95 % margin of each structure, by name.
+        margins: 95 % margin of each structure, by name, of its part inside the organ.
         errors: distance of each structure from where it truly is, by name; empty where that is not known.
+        outside: share of each structure that lies outside the organ, and of which nothing is known, by name.
         bound: on the largest nodal error of the prediction.
         confidence: of that bound, in (0, 1).
         net_force: size of the net force.
@@ -47,6 +48,7 @@ class Figures:
     reason: str = ""
     margins: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
+    outside: Mapping[str, float] = field(default_factory=dict)
     bound: float = np.nan
     confidence: float = np.nan
     net_force: float = np.nan
@@ -102,17 +104,27 @@ def _structures(figures: Figures) -> str:
     has_errors = bool(figures.errors)
     heads = ["", "95 % margin", *(["true error"] if has_errors else [])]
     rows = [
-        [_chip(colour_of(name), spoken(name)), _mm(figures.margins.get(name)), *(
-            [_mm(figures.errors.get(name))] if has_errors else []
-        )]
+        [
+            _chip(colour_of(name), spoken(name)) + _part_outside(figures.outside.get(name, 0.0)),
+            _mm(figures.margins.get(name)),
+            *([_mm(figures.errors.get(name))] if has_errors else []),
+        ]
         for name in names
-    ]  # fmt: skip
+    ]
     first = "".join(f'<th style="text-align:right;font-weight:400;font-size:13px">{head}</th>' for head in heads)
     body = "".join(
         "<tr>" + "".join(f'<td style="{_cell(i, name)}">{cell}</td>' for i, cell in enumerate(row)) + "</tr>"
         for name, row in zip(names, rows, strict=True)
     )
     return f'<table style="width:100%;border-collapse:collapse;margin-bottom:6px"><tr>{first}</tr>{body}</table>'
+
+
+def _part_outside(share: float) -> str:
+    """That a part of a structure is not known, as HTML; nothing where all of it is inside."""
+    if share == 0.0:
+        return ""
+    chip = _chip(UNINFORMED, f"{100 * share:.0f} % of it outside the organ: not known")
+    return f'<div style="font-size:12px">{chip}</div>'
 
 
 def _cell(column: int, name: str) -> str:

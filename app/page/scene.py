@@ -11,7 +11,7 @@ import viser
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.embedding import outer, target_points
+from softtwin.meshes.embedding import is_carried_along, outer, target_points
 
 from ..record import NOTICE
 from .bands import COLOURS, UNINFORMED, Colour, Scale, banded
@@ -67,6 +67,7 @@ class Picture:
         rest = self.placed(self._outer.rest.points[self._shown])
         self._bands = [self._band(number, rest, colour) for number, colour in enumerate((UNINFORMED, *COLOURS))]
         self._drawn = [np.zeros((0, 3), dtype=np.int64) for _ in self._bands]
+        self._outside = {name: is_carried_along(body, points) for name, points in self._embeddings.items()}
         self._inner = {name: self._structure(name, body.inner[name].triangles) for name in body.inner}
         self._labels = {name: self._label(name) for name in body.inner}
         self._cloud: viser.PointCloudHandle | None = None
@@ -96,7 +97,8 @@ class Picture:
             for band in self._bands:
                 band.vertices = organ
             for name, points in inner.items():
-                self._inner[name].vertices = points
+                for part in self._inner[name]:
+                    part.vertices = points
                 self._labels[name].position = _label_place(points, self._is_below(name)).astype(np.float64)
         self._server.flush()
 
@@ -124,7 +126,8 @@ class Picture:
         with self._lock:
             for name, label in self._labels.items():
                 margin = margins.get(name, np.nan)
-                label.text = f"{spoken(name)} ± {1e3 * margin:.1f} mm" if np.isfinite(margin) else spoken(name)
+                said = f"{spoken(name)} ± {1e3 * margin:.1f} mm" if np.isfinite(margin) else spoken(name)
+                label.text = f"{said} inside the organ" if np.isfinite(margin) and self._outside[name].any() else said
 
     def show_cloud(self, points: Floats | None) -> None:
         """Show a cloud; none for None.
@@ -173,15 +176,22 @@ class Picture:
             receive_shadow=False,
         )
 
-    def _structure(self, name: str, triangles: Ints) -> viser.MeshHandle:
-        return self._server.scene.add_mesh_simple(
-            f"/inner/{name}",
-            self.placed(self._inner_rest[name]),
-            triangles.astype(np.uint32),
-            color=colour_of(name),
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+    def _structure(self, name: str, triangles: Ints) -> list[viser.MeshHandle]:
+        """What lies inside the organ, and what lies outside and is carried along: where that is, is not known."""
+        outside = self._outside[name][triangles].any(axis=1)
+        parts = [("", triangles[~outside], colour_of(name)), (" outside", triangles[outside], UNINFORMED)]
+        return [
+            self._server.scene.add_mesh_simple(
+                f"/inner/{name}{word}",
+                self.placed(self._inner_rest[name]),
+                part.astype(np.uint32),
+                color=colour,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            for word, part, colour in parts
+            if len(part)
+        ]
 
     def _label(self, name: str) -> viser.LabelHandle:
         return self._server.scene.add_label(

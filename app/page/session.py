@@ -201,6 +201,7 @@ class Session:
             verdict=judgement.verdict,
             reason=reason,
             margins=margins,
+            outside={name: float(outside.mean()) for name, outside in twin.outside.items()},
             errors=errors,
             net_force=float(np.linalg.norm(found.net_force)),
             net_force_deviation=float(np.linalg.norm(found.net_force_deviation)),

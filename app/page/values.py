@@ -17,9 +17,9 @@ Floats = NDArray[np.float64]
 
 
 def margins_of(twin: Twin, found: Registration) -> dict[str, float]:
-    """The largest 95 % margin of each inner structure where it is shown, metres, by name."""
+    """The largest 95 % margin of each inner structure inside the organ, where it is shown, metres, by name."""
     known = found.uncertainty
-    return {name: float(known.margin(points).max()) for name, points in twin.embeddings.items()}
+    return {name: twin.margin_inside(name, known.margin(points)) for name, points in twin.embeddings.items()}
 
 
 def errors_of(twin: Twin, found: Registration, truth: Floats | None) -> dict[str, float]:

@@ -10,6 +10,8 @@ import pyvista
 
 from softtwin.app.config import Config, ConfigError
 from softtwin.app.export import FORMATS, Exporter, file_names
+from softtwin.app.markups import targets_of
+from softtwin.app.page.values import margins_of
 from softtwin.app.record import frame_figures
 from softtwin.app.twin import Twin
 from softtwin.meshes.io import read_surface
@@ -60,6 +62,13 @@ def test_what_lies_outside_the_organ_is_marked_as_not_known(
     assert target["outside_share"] == pytest.approx(outside.mean())
     margins = result.uncertainty.margin(twin.embeddings["tumour"])
     assert target["margin95_m"] == pytest.approx(margins[~outside].max())
+    assert margins_of(twin, result) == {"tumour": pytest.approx(margins[~outside].max())}
+    centre, *spread = targets_of(twin, result, 9)
+    assert centre.margin == pytest.approx(margins[~outside].max())
+    assert f"{100 * outside.mean():.0f} % of it lies outside the organ and is carried along: NOT KNOWN" in centre.remark
+    places = twin.body.inner["tumour"].points + twin.embeddings["tumour"].displace(result.displacement)
+    inside = {tuple(place) for place in places[~outside]}
+    assert len(spread) == (~outside).sum() > 0 and all(tuple(target.position) in inside for target in spread)
 
 
 def test_the_organ_holds_displacement_and_force(twin: Twin, result, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ pytest.importorskip("viser", reason="viser is absent")
 
 from softtwin.app.config import Config, ConfigError, read_config, to_toml
 from softtwin.app.organ import make_body
-from softtwin.app.page.bands import COLOURS, SCALES, banded
+from softtwin.app.page.bands import COLOURS, SCALES, UNINFORMED, banded
 from softtwin.app.page.brush import Brush
 from softtwin.app.page.camera import POINTS, TrueStates, View, pose_of, shot
 from softtwin.app.page.controls import engines_here
@@ -25,7 +25,7 @@ from softtwin.app.page.server import serving
 from softtwin.app.page.values import near_cloud
 from softtwin.meshes.attachment import Ball, parse_region
 from softtwin.meshes.body import Body, Surface
-from softtwin.meshes.embedding import outer
+from softtwin.meshes.embedding import is_carried_along, outer, target_points
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.shapes import beam, liver_phantom
 from softtwin.registration.verdict import Verdict
@@ -107,6 +107,10 @@ def test_figures_have_their_units_and_what_is_unknown_is_said_to_be() -> None:
     elsewhere = figures_html(Figures("registration", Verdict.ACCEPTED, pose_correction=(3.21e-3, np.deg2rad(1.24))))
     assert "camera elsewhere by" in elsewhere and "3.2 mm, 1.2°" in elsewhere
     assert "above 4 mm" in legend_html(SCALES["error"], has_uninformed=False)
+    partly = Figures("registration", Verdict.ACCEPTED, "", {"vein": 1e-3, "tumour": 1e-3},
+                     outside={"vein": 0.3, "tumour": 0.0})  # fmt: skip
+    assert figures_html(partly).count("30 % of it outside the organ: not known") == 1
+    assert figures_html(partly).count("outside the organ") == 1
 
 
 def test_the_brush_reaches_the_answer_in_steps_and_rests() -> None:
@@ -141,6 +145,26 @@ def test_the_picture_moves_vertices_in_place_and_gives_places_back(body: Body) -
         picture.name_margins({"tumour": 2.345e-3, "vessel_portal": np.inf})
         assert picture._labels["tumour"].text == "tumour ± 2.3 mm"
         assert picture._labels["vessel_portal"].text == "vessel portal"
+
+
+def test_what_lies_outside_the_organ_is_drawn_as_not_known(body: Body) -> None:
+    vein = body.inner["vessel_portal"]
+    away = vein.points + np.array([0.0, 0.0, 0.3 * np.ptp(body.points[:, 2])])
+    body = body.with_inner(vein=Surface(away, vein.triangles))
+    outside = is_carried_along(body, target_points(body)["vein"])
+    assert 0.0 < outside.mean() < 1.0
+    with serving() as server:
+        picture = Picture(server, body)
+        known, unknown = picture._inner["vein"]
+        assert not outside[known.faces].any() and outside[unknown.faces].any(axis=1).all()
+        assert len(known.faces) + len(unknown.faces) == len(vein.triangles)
+        assert known.color != unknown.color and unknown.color == UNINFORMED
+        assert len(picture._inner["tumour"]) == 1
+        picture.move(np.full_like(body.points, 1e-2))
+        assert np.array_equal(known.vertices, unknown.vertices)
+        picture.name_margins({"vein": 1e-3, "tumour": 1e-3})
+        assert picture._labels["vein"].text == "vein ± 1.0 mm inside the organ"
+        assert picture._labels["tumour"].text == "tumour ± 1.0 mm"
 
 
 def test_a_recording_is_one_page_with_the_scene_in_it(body: Body) -> None:
