@@ -1,7 +1,8 @@
 """Every program at hand writes one organ, one cloud, one label map, landmarks and a pose; softtwin reads each file.
 
 What is read is compared with what was written: volume, points, cells, labels, place and unit. A file that is not read
-has to be refused by a message that says why. The page docs/formats.md is made of the record.
+has to be refused by a message that says why. The page docs/formats.md is made of the record. SimpleITK and PyMeshLab
+write where they are installed (`pip install SimpleITK pymeshlab`; 280 MB): nothing else needs them.
 
     python benchmarks/formats.py                       # writes, reads, compares, records
     python benchmarks/formats.py --write docs/formats.md
@@ -24,7 +25,7 @@ from written import Writer, writers
 
 PACKAGES = {"trimesh": "trimesh", "pyvista": "pyvista", "VTK": "vtk", "meshio": "meshio", "gmsh": "gmsh",
             "nibabel": "nibabel", "pynrrd": "pynrrd", "NumPy": "numpy", "pypcd4": "pypcd4",
-            "SimpleITK": "SimpleITK"}  # fmt: skip
+            "SimpleITK": "SimpleITK", "PyMeshLab": "pymeshlab"}  # fmt: skip
 TITLES = {"surface": "Surfaces", "volume": "Volume meshes", "cloud": "Point clouds", "labels": "Segmentations",
           "landmarks": "Landmarks", "transform": "Poses"}  # fmt: skip
 SAME, REFUSED, OTHER = "same", "refused", "other"

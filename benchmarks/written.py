@@ -174,6 +174,36 @@ def _strips(path: Path) -> None:
     _vtk_xml(path, stripper.GetOutput(), vtk.vtkXMLPolyDataWriter(), "binary", "zlib", "little")
 
 
+def _pymeshlab(path: Path, points: np.ndarray, triangles: np.ndarray | None, **options: Any) -> None:
+    """With normals of vertices and faces, and colours where the options ask for them."""
+    import pymeshlab
+
+    colours = np.tile([0.8, 0.4, 0.2, 1.0], (len(points), 1))
+    faces = {} if triangles is None else {"face_matrix": triangles}
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=points, v_color_matrix=colours, **faces))
+    meshes.save_current_mesh(str(path), **options)
+
+
+_MESHLAB_SURFACES: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    (".stl", "binary", {"binary": True}), (".stl", "text", {"binary": False}),
+    (".stl", "binary, colours", {"binary": True, "save_face_color": True}),
+    (".obj", "", {}), (".obj", "normals", {"save_vertex_normal": True}),
+    (".obj", "colours", {"save_vertex_color": True}),
+    (".ply", "binary", {"binary": True}), (".ply", "text", {"binary": False}),
+    (".ply", "binary, quality, normals, colours, flags",
+     {"binary": True, "save_vertex_quality": True, "save_vertex_normal": True, "save_vertex_color": True,
+      "save_vertex_flag": True, "save_face_quality": True, "save_face_color": True, "save_face_flag": True}),
+    (".off", "", {}), (".x3d", "", {}), (".dae", "", {}), (".3ds", "", {}), (".ctm", "", {}), (".wrl", "", {}),
+    (".dxf", "", {}),
+)  # fmt: skip
+_MESHLAB_CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    (".ply", "binary", {"binary": True}), (".ply", "text, normals", {"binary": False, "save_vertex_normal": True}),
+    (".xyz", "", {}), (".xyz", "normals", {"save_vertex_normal": True}), (".obj", "", {}),
+    (".off", "", {}),
+)  # fmt: skip
+
+
 def _softtwin(path: Path, place: Coordinates) -> None:
     write_surface(path, Surface(place.lengths(1e-3 * surface().points), surface().triangles), place=place)
 
@@ -242,6 +272,10 @@ def _surfaces() -> Iterator[Writer]:
                      lambda p, v=version, b=binary: _gmsh(p, points, triangles, 2, 2, v, b))  # fmt: skip
     yield writer("gmsh", ".stl", "text", lambda p: _gmsh(p, points, triangles, 2, 2, 2.2, False))
     yield writer("gmsh", ".ply2", "", lambda p: _gmsh(p, points, triangles, 2, 2, 2.2, False))
+    if find_spec("pymeshlab") is not None:
+        for suffix, words, options in _MESHLAB_SURFACES:
+            yield writer("PyMeshLab", suffix, words,
+                         lambda p, o=options: _pymeshlab(p, points, triangles, **o))  # fmt: skip
     for suffix in (".stl", ".ply", ".obj", ".vtp"):
         for place in (Coordinates("mm", "ras"), Coordinates("cm", "lps"), Coordinates("m", "ras")):
             yield writer("softtwin", suffix, f"{place.unit}, {place.axes}", lambda p, at=place: _softtwin(p, at))
@@ -368,6 +402,9 @@ def _clouds() -> Iterator[Writer]:
         cloud(), colors=np.tile([9, 8, 7, 255], (300, 1))).export(p))  # fmt: skip
     for suffix in (".ply", ".vtk", ".vtp"):
         yield writer("pyvista", suffix, "", lambda p: _polydata(cloud(), None).save(p))
+    if find_spec("pymeshlab") is not None:
+        for suffix, words, options in _MESHLAB_CLOUDS:
+            yield writer("PyMeshLab", suffix, words, lambda p, o=options: _pymeshlab(p, cloud(), None, **o))
     yield writer("meshio", ".ply", "", lambda p: _meshio(p, cloud(), [("vertex", np.arange(300)[:, None])], "ply"))
 
 
