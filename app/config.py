@@ -140,6 +140,7 @@ class LoadsSection(Section):
     sequence: Literal["random", "sobol"] = option(
         "random", "how training loads are spread: at random, or evenly by a Sobol sequence"
     )
+    smoothness: float = option(0.02, "correlation length of the forces of smooth draws", unit="metres", gt=0.0)
 
 
 class SamplesSection(Section):
@@ -152,6 +153,12 @@ class SamplesSection(Section):
     test: int = option(128, "draws held out, never seen in training", ge=1)
     calibration: int = option(
         0, "draws to calibrate error bounds with, neither learned nor chosen from; 0: no bounds", ge=0
+    )
+    smooth: int = option(
+        0,
+        "draws of smooth forces on a patch, as registration expects them, to see what the surrogate gets wrong under "
+        "such; 0: it is seen under the validation draws alone",
+        ge=0,
     )
     rounds: int = option(
         0,

@@ -35,6 +35,7 @@ def load_plan(config: Config) -> LoadPlan:
         displacement=loads.displacement,
         amplitude=loads.amplitude or None,
         sequence=loads.sequence,
+        smoothness=loads.smoothness,
     )
 
 
@@ -44,6 +45,8 @@ def plan_entries(config: Config) -> dict[str, Any]:
     loads = {**vars(load_plan(config)), "zones": list(config.loads.zones), "radius": list(config.loads.radius)}
     if loads["sequence"] == "random":
         del loads["sequence"]  # as in a data set's header
+    if not samples.smooth:
+        del loads["smoothness"]
     return {
         **{word: getattr(config.material, name) for name, word in _MATERIAL.items()},
         "loads": loads,
@@ -51,6 +54,7 @@ def plan_entries(config: Config) -> dict[str, Any]:
             **{"train": samples.train, "validation": samples.validation, "test": samples.test},
             **({"calibration": samples.calibration} if samples.calibration else {}),
             **({"active": samples.rounds * samples.chosen} if samples.rounds else {}),
+            **({"smooth": samples.smooth} if samples.smooth else {}),
         },
         "block": samples.block,
         "ramp": samples.load_path,

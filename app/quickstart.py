@@ -39,7 +39,7 @@ def quickstart_config(small: bool) -> Config:
     """The configuration of the quickstart; `small` goes the same way with less of everything."""
     loads = {"displacement": 0.03, "patches": 2, "radius": (0.15, 0.5)}
     if small:
-        samples = {"train": 24, "validation": 8, "test": 8, "calibration": 12, "block": 4}
+        samples = {"train": 24, "validation": 8, "test": 8, "calibration": 12, "smooth": 8, "block": 4}
         body = {"source": "liver-phantom", "cell_size": 0.016}
         return Config.model_validate(
             # By epochs: what tests find must not depend on how busy the machine is.
@@ -51,7 +51,7 @@ def quickstart_config(small: bool) -> Config:
             "folder": ".",
             "body": {"source": "liver-phantom", "cell_size": 0.0105},
             "loads": loads,
-            "samples": {"train": 192, "validation": 24, "test": 32, "calibration": 32},
+            "samples": {"train": 192, "validation": 24, "test": 32, "calibration": 32, "smooth": 40},
             "training": {"seconds": 25.0, "width": 128},
             "model_error": {"draws": 32},
         }

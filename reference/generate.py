@@ -37,7 +37,15 @@ from .data.dataset import (
 from .data.lock import locked
 from .data.materials import MATERIALS, Material
 from .data.outcome import Equilibrium, NotConverged
-from .data.samplers import LoadPlan, QuasiRandom, check_loads, draw_load, loaded_nodes, sobol_point
+from .data.samplers import (
+    LoadPlan,
+    QuasiRandom,
+    check_loads,
+    draw_load,
+    draw_smooth_load,
+    loaded_nodes,
+    sobol_point,
+)
 from .data.schema import Reason
 from .data.shard import Shard, at_work_on, refuse_shards_at_work
 from .data.writing import create, drop_block, write_block
@@ -70,7 +78,8 @@ class Plan:
         poisson_ratio: in [0, 0.5).
         loads: how loads are drawn.
         samples: draws of each split; `calibration` may be left out, and so may `active`: whole blocks of draws that are
-            learned from, too, once `write_chosen` has said which of the `candidate_loads` they are.
+            learned from, too, once `write_chosen` has said which of the `candidate_loads` they are; `smooth` ones are
+            loads as registration expects them, which say what a model gets wrong there.
         block: draws of one block, the unit of work and of storage.
         ramp: draws that share one load at growing sizes, each solved from the one before; divides `block`. Several
             times cheaper a draw than independent loads where these need many Newton iterations from rest.
@@ -256,6 +265,8 @@ def _plain(plan: Plan) -> dict[str, Any]:
     description["samples"] = dict(plan.samples)
     if plan.loads.sequence == "random":
         del description["loads"]["sequence"]  # data sets that are older than the choice do not name it
+    if not plan.samples.get("smooth"):
+        del description["loads"]["smoothness"]  # the same, and it would tell apart what is alike
     return description
 
 
@@ -448,7 +459,10 @@ def ramp_loads(data: DataSet, plan: Plan, ramp: int) -> tuple[Floats, Floats]:
         if candidate < 0:
             raise DataSetError(f"ramp_loads.ramp: nobody has chosen yet what ramp {ramp} of {data.path} is.")
         return candidate_loads(data, plan, candidate)
-    return _drawn(data, plan, np.random.default_rng([plan.seed, 2, ramp]))
+    rng = np.random.default_rng([plan.seed, 2, ramp])
+    if ramp * plan.ramp in data.split_draws("smooth"):
+        return _sized(data, plan, draw_smooth_load(data.body, plan.loads, rng), rng.uniform(0.0, 1.0, plan.ramp))
+    return _drawn(data, plan, rng)
 
 
 def candidate_loads(data: DataSet, plan: Plan, candidate: int) -> tuple[Floats, Floats]:

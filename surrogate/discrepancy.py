@@ -1,4 +1,8 @@
-"""What a surrogate gets wrong, as patterns: the covariance of its errors on samples that it was not fitted to."""
+"""What a surrogate gets wrong, as patterns: the covariance of its errors on samples that it was not fitted to.
+
+Under forces as registration expects them, which are rougher than modal loads, a surrogate is farther off for the same
+movement: where a data set has smooth draws, they count beside the validation draws.
+"""
 
 from __future__ import annotations
 
@@ -36,21 +40,37 @@ def relative_errors(surrogate: Surrogate, data: DataSet, samples: Samples) -> Fl
 
 
 def with_discrepancy(surrogate: Surrogate, data: DataSet, maximum: int = 32) -> Surrogate:
-    """The surrogate with the patterns of its errors on the validation samples: see `discrepancy_of`.
+    """The surrogate with the patterns of its errors on validation and smooth samples: see `discrepancy_of`.
 
-    Of fewer than four samples nothing is learned: the surrogate stays as it is.
+    Of fewer than four samples nothing is learned: the surrogate stays as it is. Smooth loads beyond its domain are left
+    out: a registration that ends there says so.
 
     Args:
         surrogate: the surrogate.
         data: the data set that it was trained on.
         maximum: most patterns kept.
     """
-    samples = data.samples("validation")
-    if len(samples) < _LEAST:
+    errors = relative_errors(surrogate, data, data.samples("validation"))
+    smooth = smooth_errors(surrogate, data)
+    errors = np.concatenate([errors, smooth])
+    if len(errors) < _LEAST:
         return surrogate
-    found, bounded = discrepancy_of(relative_errors(surrogate, data, samples), data.body, maximum, _BOUND)
-    entry = {"samples": len(samples), "bounded": bounded}
+    found, bounded = discrepancy_of(errors, data.body, maximum, _BOUND)
+    entry = {"samples": len(errors), "smooth": len(smooth), "bounded": bounded}
     return _with(surrogate, found, entry)
+
+
+def smooth_errors(surrogate: Surrogate, data: DataSet) -> Floats:
+    """`relative_errors` on the smooth samples within the surrogate's domain, (s, 3n); none where there are none."""
+    if not data.header["samples"].get("smooth"):
+        return np.zeros((0, data.body.points.size))
+    samples = data.samples("smooth")
+    forces = np.zeros_like(data.body.points)
+    inside = np.zeros(len(samples), dtype=np.bool_)
+    for i, loads in enumerate(samples.forces):
+        forces[data.response.loaded] = loads
+        inside[i] = (surrogate.solve(forces).extrapolation_ratio or 0.0) <= 1.0
+    return relative_errors(surrogate, data, samples)[inside]
 
 
 def beside(surrogate: Surrogate, further: Discrepancy) -> Surrogate:

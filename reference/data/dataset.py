@@ -24,9 +24,10 @@ from .store import StoreError, is_tensors, open_store
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Split = Literal["train", "validation", "test", "calibration", "active"]
+Split = Literal["train", "validation", "test", "calibration", "active", "smooth"]
 NEEDED: tuple[Split, ...] = ("train", "validation", "test")
-SPLITS: tuple[Split, ...] = (*NEEDED, "calibration", "active")  # the active draws are learned from with the training's
+# The active draws are learned from with the training's; smooth ones are other loads: see `samplers.draw_smooth_load`.
+SPLITS: tuple[Split, ...] = (*NEEDED, "calibration", "active", "smooth")
 FORMAT = 1
 
 
@@ -240,7 +241,8 @@ class DataSet:
         """The accepted samples of a split, checked against their checksums.
 
         Args:
-            split: `train` (with the draws of active rounds behind), `validation`, `test`, `calibration` or `active`.
+            split: `train` (with the draws of active rounds behind), `validation`, `test`, `calibration`, `active` or
+                `smooth`.
             limit: take the first so many draws only.
 
         Raises:

@@ -37,7 +37,7 @@ def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
     _check(sources, path)
     first = sources[0]
     block = first.header["block"]
-    kinds: tuple[Split, ...] = (*NEEDED, "calibration")
+    kinds: tuple[Split, ...] = (*NEEDED, "calibration", "smooth")
     counts = {split: sum(map(len, _ranges(sources, split))) for split in kinds}
     counts = {split: count for split, count in counts.items() if count}
     header = {

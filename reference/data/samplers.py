@@ -29,6 +29,7 @@ class LoadPlan:
         amplitude: force that multiplies a load, newtons; given, it replaces the scaling to a displacement.
         sequence: `random`, or `sobol` for training draws that fill the space of modal loads more evenly (a scrambled
             Sobol sequence; Owen 1998); what is held out stays random.
+        smoothness: correlation length of the smooth draws, metres, where there are any: see `draw_smooth_load`.
     """
 
     kind: Literal["modal", "random"] = "modal"
@@ -39,6 +40,7 @@ class LoadPlan:
     displacement: float = 0.05
     amplitude: float | None = None
     sequence: Literal["random", "sobol"] = "random"
+    smoothness: float = 0.02
 
     def __post_init__(self) -> None:
         if self.kind not in ("modal", "random"):
@@ -51,6 +53,8 @@ class LoadPlan:
             raise ValueError(f"LoadPlan: expected at least one mode and one patch, got {self.modes}, {self.patches}.")
         if not 0.0 < self.radius[0] <= self.radius[1]:
             raise ValueError(f"LoadPlan.radius: expected 0 < smallest <= largest, got {self.radius}.")
+        if not 0.0 < self.smoothness < np.inf:
+            raise ValueError(f"LoadPlan.smoothness: expected a positive length in metres, got {self.smoothness}.")
         if not self.displacement > 0.0:
             raise ValueError(f"LoadPlan.displacement: expected a positive length in metres, got {self.displacement}.")
 
@@ -170,6 +174,33 @@ def draw_load(body: Body, shapes: Floats, plan: LoadPlan, rng: Chance) -> Floats
             forces[patch] += surface.carried(shape)[patch]
         else:
             forces[patch] += rng.uniform(-1.0, 1.0, (len(patch), 3))
+    return _at_nodes(body, forces, plan)
+
+
+def draw_smooth_load(body: Body, plan: LoadPlan, rng: np.random.Generator) -> Floats:
+    """One unscaled load as registration expects forces: a Gaussian field on a patch, (n, 3).
+
+    The forces of two places at distance d correlate by exp(-d^2 / 2 s^2) with s the plan's smoothness; components are
+    independent. These loads are rougher than modal ones: what a model gets wrong under them, modal loads do not show.
+
+    Args:
+        body: the body.
+        plan: how loads are drawn: zones, radius and smoothness.
+        rng: source of chance; the load is a function of it alone.
+    """
+    places = outer(body).rest.points
+    forces = np.zeros_like(places)
+    patch = _draw_patch(body, plan, rng)
+    apart = ((places[patch][:, None] - places[patch]) ** 2).sum(axis=2)
+    variances, fields = np.linalg.eigh(np.exp(-apart / (2.0 * plan.smoothness**2)))
+    root = fields * np.sqrt(np.maximum(variances, 0.0))
+    forces[patch] = root @ rng.standard_normal((len(patch), 3))
+    return _at_nodes(body, forces, plan)
+
+
+def _at_nodes(body: Body, forces: Floats, plan: LoadPlan) -> Floats:
+    """Forces at the nodes, (n, 3), from those at the vertices of the organ's surface."""
+    surface = outer(body)
     if surface.weights is not None:
         forces = surface.spread(forces)
         forces[np.setdiff1d(np.arange(len(forces)), loaded_nodes(body, plan))] = 0.0
