@@ -332,6 +332,36 @@ def test_sobol_draws_are_even_and_leave_what_is_held_out_alone(undisturbed: Data
         generate(undisturbed.path, body(), plan)
 
 
+def test_smooth_draws_leave_the_others_as_they_are(undisturbed: DataSet, tmp_path: Path) -> None:
+    plan = replace(PLAN, samples={**PLAN.samples, "smooth": 4}, loads=replace(PLAN.loads, smoothness=0.1))
+    made = generate(tmp_path / "data.zarr", body(), plan)
+    assert made is not None
+    assert_same(undisturbed, made)
+    smooth, others = made.samples("smooth"), made.samples("test")
+    assert smooth.draws.tolist() == [21, 22, 23, 24]  # in blocks of their own, behind all others
+    assert np.abs(smooth.forces).max(axis=(1, 2)).min() > 0.0
+    # A modal load is a combination of six shapes, masked; a smooth one has as many as its patch has nodes.
+    span = made.shapes[:, made.response.loaded].reshape(len(made.shapes), -1).T
+
+    def missed(loads: np.ndarray) -> float:
+        masked = np.abs(loads).max(axis=1) > 0.0
+        rows = np.repeat(masked, 3)
+        found = np.linalg.lstsq(span[rows], loads.ravel()[rows], rcond=None)[0]
+        return float(np.linalg.norm(span[rows] @ found - loads.ravel()[rows]) / np.linalg.norm(loads))
+
+    assert max(map(missed, others.forces)) < 1e-9 and max(map(missed, smooth.forces)) > 0.1
+    assert generate(tmp_path / "data.zarr", body(), plan).identity == made.identity
+    with pytest.raises(DataSetError, match=r"differs in .*samples\.smooth \(None there, 4 here\)"):
+        generate(undisturbed.path, body(), plan)
+    other = replace(plan, loads=replace(plan.loads, smoothness=0.2))
+    with pytest.raises(DataSetError, match=r"differs in loads\.smoothness \(0\.1 there, 0\.2 here\)"):
+        generate(made.path, body(), other)
+    unused = replace(PLAN, loads=replace(PLAN.loads, smoothness=0.2))  # without smooth draws it changes nothing
+    assert generate(undisturbed.path, body(), unused).identity == undisturbed.identity
+    with pytest.raises(ValueError, match=r"LoadPlan\.smoothness: expected a positive length in metres, got 0"):
+        LoadPlan(smoothness=0.0)
+
+
 def test_a_point_of_a_sequence_draws_in_its_range() -> None:
     chance = QuasiRandom(np.array([0.0, 0.999999, 0.5, 0.25, 0.75]))
     assert [chance.integers(1, 4), chance.integers(3), chance.uniform(2.0, 4.0)] == [1, 2, 3.0]

@@ -12,9 +12,10 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.io import FileError, read_body, write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import NeoHookean
-from softtwin.reference.data.samplers import LoadPlan, draw_load, loaded_nodes
+from softtwin.reference.data.samplers import LoadPlan, draw_load, draw_smooth_load, loaded_nodes
 from softtwin.reference.modes import eigenmodes, load_modes, save_modes
 from softtwin.reference.solve.problem import Problem
+from softtwin.registration.parameters.nodal_forces import nodal_forces
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +69,33 @@ def test_loads_are_a_function_of_their_seed(modal) -> None:
     plan = LoadPlan(modes=10, patches=3)
     first, again, other = (draw_load(problem.body, modes.shapes, plan, np.random.default_rng(s)) for s in (4, 4, 5))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+def test_smooth_loads_have_the_correlation_that_registration_expects() -> None:
+    """Over many draws of the same patch: exp(-d^2 / 2 s^2) between nodes, none between components."""
+    body = beam((4, 4, 4), (0.06, 0.06, 0.06), "tetrahedron")
+    plan = LoadPlan(radius=(2.0, 2.0), smoothness=0.02)  # each patch is the whole free boundary
+    draws = np.stack([draw_smooth_load(body, plan, np.random.default_rng(i)) for i in range(2000)])
+    nodes = loaded_nodes(body, plan)
+    assert np.abs(draws[:, np.setdiff1d(np.arange(len(body.points)), nodes)]).max() == 0.0
+    apart = ((body.points[nodes][:, None] - body.points[nodes]) ** 2).sum(axis=2)
+    prior = nodal_forces(body, nodes, smoothness=0.02)
+    root = prior.patterns[::3, ::3]
+    np.testing.assert_allclose(root @ root.T, np.exp(-apart / (2.0 * 0.02**2)), atol=1e-4)
+    for axis in range(3):
+        one = draws[:, nodes, axis]
+        # The mean of 2,000 products of unit variance is off by 1 / sqrt(2000): five times that, over all pairs.
+        assert np.abs(one.T @ one / len(one) - root @ root.T).max() < 5.5 * np.sqrt(2.0 / len(one))
+        assert np.abs(one.T @ draws[:, nodes, axis - 1] / len(one)).max() < 5.5 / np.sqrt(len(one))
+
+
+def test_smooth_loads_stay_on_a_patch_of_a_zone(modal) -> None:
+    problem, _ = modal
+    plan = LoadPlan(zones=("tip",), radius=(0.1, 0.3))
+    first, again, other = (draw_smooth_load(problem.body, plan, np.random.default_rng(s)) for s in (4, 4, 5))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+    carrying = np.flatnonzero(np.abs(first).max(axis=1))
+    assert len(carrying) > 0 and np.isin(carrying, problem.body.node_sets["tip"]).all()
 
 
 def test_zones_confine_the_loads(modal, rng) -> None:

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.discrepancy import discrepancy_of
 from softtwin.surrogate import discrepancy
-from softtwin.surrogate.discrepancy import relative_errors, with_discrepancy
+from softtwin.surrogate.discrepancy import relative_errors, smooth_errors, with_discrepancy
+from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.twin import load, save
 
@@ -57,6 +59,26 @@ def test_a_saved_twin_keeps_them(reduced: Surrogate, data: DataSet, tmp_path: Pa
     np.testing.assert_array_equal(again.modes, known.discrepancy.modes)
     np.testing.assert_array_equal(again.rest, known.discrepancy.rest)
     assert again.places == known.discrepancy.places > 1.0
+
+
+def test_smooth_samples_count_beside_the_validation_samples(
+    reduced: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here the test samples stand for them; one is made too large for the surrogate's domain."""
+    smooth = data.samples("test")
+    smooth.forces[2] *= 100.0
+    monkeypatch.setitem(data.header["samples"], "smooth", len(smooth))
+    real = DataSet.samples
+    monkeypatch.setattr(DataSet, "samples", lambda it, split, *_: smooth if split == "smooth" else real(it, split))
+    known = with_domain(reduced, data)
+    missing = relative_errors(known, data, data.samples("validation"))
+    inside = np.delete(relative_errors(known, data, smooth), 2, axis=0)
+    both = np.concatenate([missing, inside])
+    found = with_discrepancy(known, data, maximum=len(both))
+    assert found.card["discrepancy"]["samples"] == len(both) and found.card["discrepancy"]["smooth"] == len(inside)
+    np.testing.assert_allclose(smooth_errors(known, data), inside)
+    expected, _ = discrepancy_of(both, data.body, len(both), discrepancy._BOUND)
+    np.testing.assert_allclose((found.discrepancy.modes**2).sum(), (expected.modes**2).sum())
 
 
 def test_too_few_samples_say_nothing(reduced: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
