@@ -43,12 +43,21 @@ def build_twin(
     Raises:
         ConfigError: equilibria were solved there with another configuration or other files.
     """
-    space = prepare(config, output, again)
+    space = prepare(config if again else _as_solved(config, output, say), output, again)
     make_twin(space, output / "organ.toml", say, again, device, processes)
     say(f"\ntwin: {space.twin}")
     say(f"next: softtwin register {space.twin} CLOUDS...   and: softtwin report {output / 'organ.toml'}")
     say(NOTICE)
     return space
+
+
+def _as_solved(config: Config, output: Path, say: Say) -> Config:
+    """The configuration without smooth draws where the equilibria that lie there are from before there were any."""
+    data = solved_data(Workspace(config, output))
+    if data is None or not config.samples.smooth or data.header["samples"].get("smooth"):
+        return config
+    say("equilibria: those here have no smooth draws; error patterns are learned from the validation draws alone")
+    return config.model_copy(update={"samples": config.samples.model_copy(update={"smooth": 0})})
 
 
 def prepare(config: Config, output: Path, again: bool = False) -> Workspace:

@@ -20,7 +20,7 @@ pytest.importorskip("torch", reason="torch is absent")
 from softtwin.app import chain, launch
 from softtwin.app.chain import build_twin
 from softtwin.app.cli import main
-from softtwin.app.config import Config, ConfigError, to_toml
+from softtwin.app.config import Config, ConfigError, parse_config, read_config, to_toml
 from softtwin.app.doctor import available_cores
 from softtwin.app.installation import Launcher
 from softtwin.app.stages.learn import train_stage
@@ -178,6 +178,24 @@ def test_build_may_be_repeated_with_other_options_until_it_succeeds(capsys, tmp_
     words += ["--displacement", 0.05, "--output", tmp_path / "out"]
     assert "body.fixed" in run(capsys, *words, code=2)
     assert "held-out" in run(capsys, *words, "--fixed", tmp_path / "fixed.txt")
+    assert read_config(tmp_path / "out" / "organ.toml")[0].samples.smooth == 12
+    assert len(DataSet(tmp_path / "out" / "data.zarr").samples("smooth")) == 12
+
+
+def test_build_keeps_equilibria_from_before_there_were_smooth_draws(tmp_path: Path) -> None:
+    write_files(tmp_path, bar())
+    words = {"folder": ".", "body": {"source": str(tmp_path / "beam.vtu"), "fixed": str(tmp_path / "fixed.txt")}}
+    words |= {"loads": {"modes": 4}, "training": {"epochs": 2, "modes": 4, "width": 8}, "model_error": {"draws": 0}}
+    counts = {"train": 4, "validation": 2, "test": 2, "block": 2, "ranks": 1, "jacobians": False}
+    said = list[str]()
+    build_twin(parse_config({**words, "samples": counts}), tmp_path / "out", said.append)
+    before = DataSet(tmp_path / "out" / "data.zarr").identity
+    said.clear()
+    build_twin(parse_config({**words, "samples": {**counts, "smooth": 4}}), tmp_path / "out", said.append)
+    assert said[0].startswith("equilibria: those here have no smooth draws")
+    assert DataSet(tmp_path / "out" / "data.zarr").identity == before
+    build_twin(parse_config({**words, "samples": {**counts, "smooth": 4}}), tmp_path / "out", said.append, again=True)
+    assert len(DataSet(tmp_path / "out" / "data.zarr").samples("smooth")) == 4
 
 
 def test_training_refuses_the_data_of_another_mesh(capsys, copy: Path) -> None:
