@@ -457,7 +457,7 @@ def build(
             "validation": max(8, given["train"] // 8),
             "test": max(8, given["train"] // 4),
             "calibration": max(12, given["train"] // 4),
-            "smooth": max(12, given["train"] // 8),
+            "smooth": max(8, given["train"] // 8),
             "ranks": given["ranks"],
             "load_path": given["load_path"],
             "jacobians": given["jacobians"],

@@ -51,7 +51,7 @@ def quickstart_config(small: bool) -> Config:
             "folder": ".",
             "body": {"source": "liver-phantom", "cell_size": 0.0105},
             "loads": loads,
-            "samples": {"train": 192, "validation": 24, "test": 32, "calibration": 32, "smooth": 40},
+            "samples": {"train": 192, "validation": 24, "test": 32, "calibration": 32, "smooth": 24},
             "training": {"seconds": 25.0, "width": 128},
             "model_error": {"draws": 32},
         }

@@ -178,8 +178,8 @@ def test_build_may_be_repeated_with_other_options_until_it_succeeds(capsys, tmp_
     words += ["--displacement", 0.05, "--output", tmp_path / "out"]
     assert "body.fixed" in run(capsys, *words, code=2)
     assert "held-out" in run(capsys, *words, "--fixed", tmp_path / "fixed.txt")
-    assert read_config(tmp_path / "out" / "organ.toml")[0].samples.smooth == 12
-    assert len(DataSet(tmp_path / "out" / "data.zarr").samples("smooth")) == 12
+    assert read_config(tmp_path / "out" / "organ.toml")[0].samples.smooth == 8
+    assert len(DataSet(tmp_path / "out" / "data.zarr").samples("smooth")) == 8
 
 
 def test_build_keeps_equilibria_from_before_there_were_smooth_draws(tmp_path: Path) -> None:
