@@ -53,7 +53,8 @@ class Row:
         unit: in words.
         scale: that the stored number is multiplied with.
         digits: significant ones.
-        peer: what the thesis or the best peer has, with the source.
+        peer: what the thesis or the best peer has, with the source; `{}` for each figure of `same_run`.
+        same_run: ways to figures of others in the same record, scaled as the row's own.
         target: what was asked for, as a number in the same unit; None for nothing.
         most: whether the target is the largest good value, and not the least.
         front: whether it stands on the dashboard as well.
@@ -67,6 +68,7 @@ class Row:
     scale: float = 1.0
     digits: int = 3
     peer: str = ""
+    same_run: tuple[Way, ...] = ()
     target: float | None = None
     most: bool = True
     front: bool = False
@@ -75,6 +77,12 @@ class Row:
     def value(self) -> float:
         """The figure in its unit."""
         return self.scale * _at(load(self.record)["figures"], self.way)
+
+    @property
+    def others(self) -> str:
+        """What others have, in words."""
+        figures = load(self.record)["figures"]
+        return self.peer.format(*(shown(self.scale * _at(figures, way), self.digits) for way in self.same_run))
 
     @property
     def is_short(self) -> bool:
@@ -143,7 +151,7 @@ def table(rows: Iterable[Row]) -> str:
         ours = f"{shown(row.value, row.digits)} {row.unit}".strip()
         asked = "" if row.target is None else f"{'at most' if row.most else 'at least'} {row.target:g}"
         short = " (**short**)" if row.is_short else ""
-        lines.append(f"| {row.quantity} | {ours}{short} | {row.peer} | {asked} | {made(row)} |")
+        lines.append(f"| {row.quantity} | {ours}{short} | {row.others} | {asked} | {made(row)} |")
     return "\n".join(lines)
 
 
@@ -206,7 +214,11 @@ def placed(page: str, text: str) -> str:
 
 def _rows() -> tuple[Row, ...]:
     entries = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())["row"]
-    return tuple(Row(**{**entry, "way": tuple(entry["way"])}) for entry in entries)
+    ways = [tuple(tuple(way) for way in entry.get("same_run", ())) for entry in entries]
+    return tuple(
+        Row(**{**entry, "way": tuple(entry["way"]), "same_run": same_run})
+        for entry, same_run in zip(entries, ways, strict=True)
+    )
 
 
 ROWS = _rows()

@@ -35,6 +35,19 @@ def test_a_figure_that_misses_what_was_asked_for_is_marked() -> None:
     assert "(**short**)" not in dashboard.table([row for row in dashboard.ROWS if not row.is_short])
 
 
+def test_what_others_reached_in_the_same_run_is_read_from_its_record() -> None:
+    """A typed figure would stay behind when the record is made anew."""
+    told = [row for row in dashboard.ROWS if re.search("same (run|record)", row.peer)]
+    assert len(told) > 5
+    for row in told:
+        assert row.peer.count("{}") == len(row.same_run) > 0, row.quantity
+        before = re.split(
+            r"\{\}", re.sub(r"\([^()]*\d{4}[^()]*\)|thesis.*|4,096 |of 100|full steps: 20 %", "", row.peer)
+        )
+        assert not any(re.search(r"\d", part) for part in before), row.quantity
+        assert row.others in dashboard.table([row])
+
+
 def test_a_changed_record_changes_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """The check itself: another figure in the record, and the page is not its any more."""
     page = (PAGES / "live.md").read_text()
