@@ -118,7 +118,9 @@ def made(row: Row) -> str:
     told: dict[str, Any] = {"commit": record.get("commit"), "date": record.get("date", ""), "on": processor(record)}
     figures = record["figures"]
     for place in (record.get("made", {}), figures if isinstance(figures, dict) else {}):
-        one = place.get(row.way[0]) if isinstance(place, dict) else None
+        one = place.get(row.way[0], place.get("")) if isinstance(place, dict) else None  # "": rows without their own
+        if isinstance(one, dict) and place is record.get("made"):
+            told["commit"] = one.get("commit")  # a row from before rows had commits is of none, whatever came later
         if isinstance(one, dict):
             told |= {name: one[name] for name in told if name in one}
             own = one.get("made")

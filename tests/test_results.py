@@ -48,6 +48,17 @@ def test_what_others_reached_in_the_same_run_is_read_from_its_record() -> None:
         assert row.others in dashboard.table([row])
 
 
+def test_a_row_without_a_commit_of_its_own_is_not_given_a_later_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    record = {
+        "commit": "new", "date": "today", "machine": {},
+        "figures": {"old": {"f": 1.0}, "new": {"f": 2.0}},
+        "made": {"": {"date": "once"}, "new": {"commit": "new", "date": "today"}},
+    }  # fmt: skip
+    monkeypatch.setattr(dashboard, "load", lambda name: record)
+    rows = [dashboard.Row("live", name, "some", (name, "f")) for name in ("old", "new")]
+    assert [dashboard.made(row) for row in rows] == ["no commit, once", "new, today"]
+
+
 def test_a_changed_record_changes_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """The check itself: another figure in the record, and the page is not its any more."""
     page = (PAGES / "live.md").read_text()
