@@ -40,6 +40,7 @@ def liver_config(seconds: float, ranks: int, draws: int = 1360) -> Config:
                 "train": draws,
                 "validation": held_out,
                 "test": held_out,
+                "smooth": held_out,
                 "block": 8,
                 "ramp": 2,
                 "ranks": ranks,
