@@ -123,8 +123,8 @@ def _part_outside(share: float) -> str:
     """That a part of a structure is not known, as HTML; nothing where all of it is inside."""
     if share == 0.0:
         return ""
-    chip = _chip(UNINFORMED, f"{100 * share:.0f} % of it outside the organ: not known")
-    return f'<div style="font-size:12px">{chip}</div>'
+    words = f"{100 * share:.0f} % of it outside the organ: not known"
+    return f'<div style="font-size:12px;color:#666">{words}</div>'
 
 
 def _cell(column: int, name: str) -> str:
