@@ -67,10 +67,21 @@ def nesting(surface: Surface, pieces: Ints, is_closed: Flags) -> Nesting:
         probes = surface.points[mine[np.linspace(0, len(mine) - 1, _SAMPLES).astype(int)]]
         for outer in large:
             fits = (low[outer] <= low[inner]).all() and (high[inner] <= high[outer]).all() and outer != inner
-            if fits and (winding_numbers(surface, surface.triangles[pieces == outer], probes) > _INSIDE).all():
+            if fits and encloses(surface, surface.triangles[pieces == outer], probes).all():
                 depths[inner] += 1
                 holders[inner] = max(outer, holders[inner], key=lambda one: sizes[one])
     return Nesting(depths, sizes, volumes < 0, holders, np.isin(np.arange(count), large))
+
+
+def encloses(surface: Surface, triangles: Ints, points: Floats) -> Flags:
+    """Which points lie inside what some triangles of a surface enclose, (p,).
+
+    Args:
+        surface: that has them, metres.
+        triangles: (t, 3) of its vertices.
+        points: (p, 3), metres.
+    """
+    return winding_numbers(surface, triangles, points) > _INSIDE
 
 
 def winding_numbers(surface: Surface, triangles: Ints, points: Floats) -> Floats:

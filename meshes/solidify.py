@@ -16,7 +16,7 @@ from .checks import Defects, SurfaceError, compacted, merged, piece_numbers, put
 from .closest import distances, polydata
 from .components import Cavities, ComponentError, Structures, chosen_component
 from .metrics import cell_volumes, tetrahedron_quality
-from .nesting import nesting, winding_numbers
+from .nesting import encloses, nesting
 from .smoothing import Flags, improved, outer_faces, used_points
 from .tetwild import tetrahedra
 
@@ -37,7 +37,7 @@ _SEARCHES = 5
 _COUNT_TOLERANCE = 0.15
 _SLOPE = 2.2  # nodes fall with this power of the cell size: 3 inside, 2 on the surface, less where details bind
 _UNPINCHES = 20
-_PROBES, _INSIDE = 7, 0.5  # vertices of a structure that are asked, and the winding number above which one is inside
+_PROBES = 7  # vertices of a structure that are asked whether they lie inside a component
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def _component(surface: Surface, component: str, structures: Structures) -> tupl
 def _away(surface: Surface, triangles: Ints, vertices: Floats) -> float:
     """How far a structure is from what some triangles enclose, metres: 0 where a part of it is inside."""
     probes = vertices[np.linspace(0, len(vertices) - 1, min(_PROBES, len(vertices))).astype(int)]
-    if (winding_numbers(surface, triangles, probes) > _INSIDE).any():
+    if encloses(surface, triangles, probes).any():
         return 0.0
     return float(distances(Surface(surface.points, triangles), vertices).min())
 

@@ -50,9 +50,8 @@ def with_discrepancy(surrogate: Surrogate, data: DataSet, maximum: int = 32) -> 
         data: the data set that it was trained on.
         maximum: most patterns kept.
     """
-    errors = relative_errors(surrogate, data, data.samples("validation"))
     smooth = smooth_errors(surrogate, data)
-    errors = np.concatenate([errors, smooth])
+    errors = np.concatenate([relative_errors(surrogate, data, data.samples("validation")), smooth])
     if len(errors) < _LEAST:
         return surrogate
     found, bounded = discrepancy_of(errors, data.body, maximum, _BOUND)
