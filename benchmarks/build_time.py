@@ -28,7 +28,7 @@ def work(row: str, given: Given) -> dict[str, Any]:
     np.savetxt(folder / "reach_mm.txt", 1e3 * body.points[body.node_sets["s1"]])
     out, begin = folder / "out", time.perf_counter()
     words = ["build", folder / "liver_mm.stl", "--unit", "mm", "--fixed", folder / "veins_mm.txt", "--output", out]
-    words += ["--zone", f"reach={folder / 'reach_mm.txt'}", "--displacement", 0.05, "--ramp", 8]
+    words += ["--zone", f"reach={folder / 'reach_mm.txt'}", "--displacement", 0.05, "--load-path", 8]
     words += ["--young-modulus", YOUNG_MODULUS, "--poisson-ratio", POISSON_RATIO]
     words += ["--nodes", given.nodes, "--samples", given.samples, "--seconds", given.seconds]
     softtwin([str(word) for word in words])
