@@ -265,7 +265,12 @@ class Twin:
         return self._posed_result(cloud, zone, camera, run)
 
     def ways(
-        self, zone: str | None, camera: Camera, until: float = np.inf, landmarks: Landmarks | None = None
+        self,
+        zone: str | None,
+        camera: Camera,
+        until: float = np.inf,
+        landmarks: Landmarks | None = None,
+        terms: tuple[ResidualTerm, ...] = (),
     ) -> TwinWays:
         """How the next cloud of a sequence can be registered.
 
@@ -275,8 +280,9 @@ class Twin:
             until: no step is begun after this time of the monotonic clock, seconds; a search beside the frames has no
                 such limit.
             landmarks: as for `register`.
+            terms: as for `register`.
         """
-        return TwinWays(self, zone, camera or self.as_said, until, landmarks)
+        return TwinWays(self, zone, camera or self.as_said, until, landmarks, terms)
 
     def _measured(
         self,
@@ -316,7 +322,14 @@ class Twin:
         assert camera != "align"
         return run(self.registrar(zone, camera), points)
 
-    def stream(self, clouds: Iterable[ArrayLike], zone: str | None = None, camera: Camera = None) -> Iterator[Frame]:
+    def stream(
+        self,
+        clouds: Iterable[ArrayLike],
+        zone: str | None = None,
+        camera: Camera = None,
+        *,
+        terms: tuple[ResidualTerm, ...] = (),
+    ) -> Iterator[Frame]:
         """Clouds registered in their order as they come, each from the last result that was not refused.
 
         A cloud that cannot be registered gives a refused frame with the reason, and the stream goes on.
@@ -325,13 +338,14 @@ class Twin:
             clouds: one cloud a frame, (p, 3), metres.
             zone: as for `register`.
             camera: where the camera stands, for all clouds; `align` looks for it in the first that shows it.
+            terms: as for `register`, for all clouds.
 
         Raises:
             ConfigError: no such zone.
         """
         sequence = Sequence(self, zone, camera)
         for cloud in clouds:
-            yield sequence.register(cloud)
+            yield sequence.register(cloud, terms=terms)
 
     def targets(self, result: Registration) -> dict[str, Floats]:
         """Where the vertices of each inner surface are after a registration, (p, 3), metres, by name.
@@ -515,6 +529,7 @@ class TwinWays:
     camera: Camera
     until: float
     landmarks: Landmarks | None
+    terms: tuple[ResidualTerm, ...] = ()
     before_step: Callable[[], None] | None = None
 
     def beside(self, before_step: Callable[[], None]) -> TwinWays:
@@ -548,7 +563,7 @@ class TwinWays:
             limited = registrar.limited(self.until) if self.until < np.inf else registrar
             if self.before_step is not None:
                 limited = _registrar(registrar).beside(self.before_step)
-            return follow(self.twin._measured(limited, self.landmarks, None, self.camera), points)
+            return follow(self.twin._measured(limited, self.landmarks, None, self.camera, self.terms), points)
 
         return self.twin._posed_result(cloud, self.zone, self.camera, run)
 
@@ -580,16 +595,23 @@ class Sequence:
         """End: what is still searched for beside the frames is forgotten."""
         self._tracker.close()
 
-    def register(self, cloud: ArrayLike, until: float = np.inf, landmarks: Landmarks | None = None) -> Frame:
+    def register(
+        self,
+        cloud: ArrayLike,
+        until: float = np.inf,
+        landmarks: Landmarks | None = None,
+        terms: tuple[ResidualTerm, ...] = (),
+    ) -> Frame:
         """The next frame; refused, with the reason, where the cloud cannot be registered.
 
         Args:
             cloud: (p, 3), metres.
             until: no step is begun after this time of the monotonic clock, seconds: the result is the best so far.
             landmarks: as for `Twin.register`.
+            terms: as for `Twin.register`.
 
         Raises:
-            ConfigError, ValueError: landmarks that the twin cannot take.
+            ConfigError, ValueError: landmarks or terms that the twin cannot take.
         """
         begin = time.perf_counter()
         try:
@@ -597,7 +619,7 @@ class Sequence:
             points = given.array()
             if self.camera == "align":
                 self.camera = self.twin.aligned(points)
-            result = self._tracker.take(points, self.twin.ways(self.zone, self.camera, until, landmarks))
+            result = self._tracker.take(points, self.twin.ways(self.zone, self.camera, until, landmarks, terms))
         except (CloudError, NotConverged) as error:
             return self.refuse(str(error), time.perf_counter() - begin)
         count = 0 if landmarks is None else len(np.asarray(landmarks[0]))

@@ -62,7 +62,7 @@ class ForceHyperprior:
     """
 
     clear: float = 0.0
-    spread: float = field(default_factory=lambda: POLICY.force_spread_free)
+    spread: float = field(default_factory=lambda: POLICY.spread_unknown)
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def options_for(model: ForwardModel, has_zone: bool) -> RegistrationOptions:
         has_zone: the nodes that may carry force are those that a tool can touch.
     """
     if model.error == 0.0:
-        clear = POLICY.force_scale_free_below * POLICY.noise_minimum
+        clear = POLICY.excess * POLICY.noise_minimum
         localisation = SparseLocalisation(rounds=0 if has_zone else POLICY.rounds, points=_MANY)
         return RegistrationOptions(localisation=localisation, hyperprior=ForceHyperprior(clear))
     if has_zone:

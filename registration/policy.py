@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 
+import numpy as np
 from scipy.special import ndtri
 
 _CHANCE = "chance"  # unit of one
@@ -67,9 +68,6 @@ class Policy:
     shared_length_spread: float = choice(
         0.5, "", "standard deviation of its logarithm", "misspecified, noise that neighbours share"
     )
-    shared_length_maximum: float = choice(
-        3.0, "times the median", "most of it: a field over all of the side is a movement", "pose_noise"
-    )
 
     # What is believed of the model's error.
     discrepancy_spread: float = choice(
@@ -78,11 +76,14 @@ class Policy:
         "standard deviation of the logarithm of what the model gets wrong over what it was seen to",
         "foreign_patches, raised by 10 mm: with 0.5 three of twelve frames take the patch for the model's error",
     )
-    discrepancy_spread_below: float = choice(
+    spread_unknown: float = choice(
         1.0,
         "",
-        "the same where it gets less wrong: a state near those that it knows well",
-        "misspecified, ensemble, ratio 0.45 to 0.49: with 0.25 the error is 0.25 in place of 0.22 mm",
+        "standard deviation of the logarithm of a scale of which little is known: of what the model gets wrong where "
+        "it is less than was seen, at a state near those that it knows well; of the size of a nodal force of an exact "
+        "model where the cloud is clear enough to tell it",
+        "misspecified, ensemble, ratio 0.45 to 0.49: with 0.25 the error is 0.25 in place of 0.22 mm; robustness, "
+        "reference, clean: a sharp pull of an unexpected size would be called outliers",
     )
     discrepancy_minimum: float = choice(
         0.5,
@@ -107,20 +108,11 @@ class Policy:
         "standard deviation of the logarithm of a nodal force's size: with more, forces explain noise",
         "robustness, surrogate: noise 5 mm (0.35, 0.5, 1.0: 0.52, 0.54, 0.64 mm)",
     )
-    force_spread_free: float = choice(
-        1.0,
-        "",
-        "the same of an exact model where the cloud can tell it: see `force_scale_free_below`",
-        "robustness, reference: clean; a sharp pull of an unexpected size would be called outliers",
-    )
     force_spread_anywhere: float = choice(
         0.7,
         "",
         "the same of a model that errs, where no zone is told: forces gathered at a small place are larger",
         "misspecified, surrogate: as it is; smaller values make it worse",
-    )
-    force_scale_free_below: float = choice(
-        2.0, "times the least noise", "a clearer cloud tells the size of the forces", "robustness, reference: clean"
     )
     force_reach: float = choice(
         0.02,
@@ -174,7 +166,8 @@ class Policy:
         1.5,
         "times what was to be expected",
         "so much above a level no result is of use; so much more than it was seen to be, the model's error explains "
-        "nothing; at so much larger distances than in the last frame a cloud is searched for from rest",
+        "nothing; at so much larger distances than in the last frame a cloud is searched for from rest; with so much "
+        "of the least noise it is still clear",
         "verdict: another organ, patch of 30 % by 10 mm; liver sequences: frames of changed places of force",
     )
     elsewhere: float = choice(
@@ -183,6 +176,11 @@ class Policy:
         "less of them left with forces elsewhere, or with one contact not: forces act otherwise than was said",
         "contact, robustness: no zone",
     )
+
+    @property
+    def shared_length_maximum(self) -> float:
+        """Longest length of shared noise, in medians: two standard deviations; longer ones are movements."""
+        return float(np.exp(2.0 * self.shared_length_spread))
 
     @property
     def deviations(self) -> float:

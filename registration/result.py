@@ -151,7 +151,7 @@ class Registration:
     @property
     def coefficients(self) -> Floats:
         """Of all parameter blocks, (k,)."""
-        return self.evaluation.coefficients
+        return self.posterior.mean
 
     @property
     def eta(self) -> Floats:

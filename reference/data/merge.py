@@ -26,7 +26,8 @@ def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
 
     Args:
         sources: at least two, complete, of one body, one material, the same modes and as many draws of each load path
-            (`ramp`): a bound that is calibrated on paths of two kinds holds for loads of neither.
+            (`ramp`): a bound that is calibrated on paths of two kinds holds for loads of neither. Where several have
+            smooth draws, these are as smooth in all.
         path: folder to make.
 
     Raises:
@@ -43,7 +44,7 @@ def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
     header = {
         **{name: entry for name, entry in first.header.items() if name not in ("format", "body", "checksums")},
         "samples": counts,
-        "plan": {**stored_plan(first.header), "samples": counts},
+        "plan": {**stored_plan(first.header), **_loads(sources), "samples": counts},
         "merged": [_told(source) for source in sources],
     }
     partial = path.with_name(f".{path.name}.partial")
@@ -56,6 +57,19 @@ def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
             number += 1
     partial.rename(path)
     return DataSet(path)
+
+
+def _smoothness(source: DataSet) -> float | None:
+    """Correlation length of a set's smooth draws, metres; None where it has none."""
+    told = stored_plan(source.header).get("loads", {}).get("smoothness")
+    return float(told) if len(source.split_draws("smooth")) and told is not None else None
+
+
+def _loads(sources: Sequence[DataSet]) -> dict[str, Any]:
+    """The first plan's loads, with how smooth the smooth draws of any set are."""
+    loads = stored_plan(sources[0].header).get("loads")
+    known = [each for each in map(_smoothness, sources) if each is not None]
+    return {"loads": {**loads, "smoothness": known[0]}} if loads is not None and known else {}
 
 
 def _told(source: DataSet) -> dict[str, Any]:
@@ -93,6 +107,12 @@ def _check(sources: Sequence[DataSet], path: Path) -> None:
                 f"merge.sources: expected gradients for the same modes, got others in {where}; make both with the same "
                 "loads.modes, on one machine."
             )
+    smooth = sorted({each for each in map(_smoothness, sources) if each is not None})
+    if len(smooth) > 1:
+        raise DataSetError(
+            f"merge.sources: expected smooth draws of one correlation length (loads.smoothness), got {smooth[0]:g} and "
+            f"{smooth[-1]:g} m: what is told of them would hold for neither."
+        )
     _refuse_twice(sources)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +93,13 @@ class BlockPosterior:
 
 
 class ParameterBlock:
-    """Coefficients with a normal law of mean zero beforehand, and what they do."""
+    """Coefficients with a normal law of mean zero beforehand, and what they do.
+
+    Attributes:
+        has_own_figures: records show figures of its own in place of estimates, and its checks look at these.
+    """
+
+    has_own_figures: ClassVar[bool] = False
 
     @property
     def size(self) -> int:
@@ -159,13 +165,21 @@ class ParameterBlock:
         return None
 
     def estimates(self, mean: Floats, covariance: Floats) -> tuple[Estimate, ...]:
-        """What is known of each of its parameters, for records and reports; none for those that have other figures.
+        """What is known of each of its parameters, for records and reports.
+
+        By default that of each coefficient, in deviations of what was believed of it, under the name of the class.
 
         Args:
             mean: coefficients found, (c,).
             covariance: of theirs, (c, c).
         """
-        return ()
+        if self.has_own_figures:
+            return ()
+        name, many = type(self).__name__, self.size > 1
+        return tuple(
+            estimate(f"{name} {place}" if many else name, "deviations", float, float(value), float(variance))
+            for place, (value, variance) in enumerate(zip(mean, np.diag(covariance), strict=True), 1)
+        )
 
     def checks(self, found: BlockPosterior, expected: Expectations) -> Iterator[Check]:
         """What would make a result doubtful: by default, estimates far from where they were expected.
@@ -174,15 +188,16 @@ class ParameterBlock:
             found: what is known of the coefficients.
             expected: what a usable result looks like.
         """
-        for known in self.estimates(found.mean, found.covariance):
+        every = self.estimates(found.mean, found.covariance)
+        for known in every:
             far = f"{known.name} lies {known.deviations:.1f} deviations from where it was expected"
             yield checked(
                 Code.PARAMETER,
                 known.deviations,
-                normal_level(expected.unlikely),
+                normal_level(expected.unlikely, len(every)),
                 far,
                 unit="deviations",
-                law=largest_normal(known.deviations, 1),
+                law=largest_normal(known.deviations, len(every)),
                 subject=known.name,
             )
 

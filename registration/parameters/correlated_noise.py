@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ class CorrelatedNoise(ParameterBlock):
     Args:
         modes: these functions.
     """
+
+    has_own_figures: ClassVar[bool] = True
 
     def __init__(self, modes: SurfaceModes) -> None:
         self.modes = modes

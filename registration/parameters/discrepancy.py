@@ -6,6 +6,7 @@ import copy
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,8 @@ class ModelError(FieldBlock):
         amplitude: largest displacement that is reckoned with, metres.
     """
 
+    has_own_figures: ClassVar[bool] = True
+
     def __init__(self, discrepancy: Discrepancy, observed: SurfaceDistance, amplitude: float = 1.0) -> None:
         super().__init__(discrepancy.modes, observed, amplitude)
         self.discrepancy = discrepancy
@@ -65,7 +68,7 @@ class ModelError(FieldBlock):
                 1.0,
                 POLICY.discrepancy_spread,
                 POLICY.discrepancy_minimum,
-                spread_below=POLICY.discrepancy_spread_below,
+                spread_below=POLICY.spread_unknown,
             )
         }
 
@@ -95,6 +98,8 @@ class RestOfModelError(ParameterBlock):
         modes: of the observed side, in which it varies over it.
         logs: logarithms of their variances, for a field of unit variance.
     """
+
+    has_own_figures: ClassVar[bool] = True
 
     def __init__(self, deviation: Floats, modes: SurfaceModes, logs: Floats) -> None:
         self.deviation, self.modes, self.logs = deviation, modes, logs

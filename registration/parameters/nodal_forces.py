@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,6 +43,8 @@ class NodalForces(ParameterBlock):
         every: the patterns before any direction was left out, (3a, m); None where none was.
         kept: orthonormal combinations of these that are left, (m, k); None as above.
     """
+
+    has_own_figures: ClassVar[bool] = True
 
     nodes: Ints
     patterns: Floats

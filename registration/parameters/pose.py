@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ class PosePrior(ParameterBlock):
         translation_deviation: standard deviation of the shift along each axis, metres.
         is_said: the expected pose is the one that results are told in: what is found beside it counts as displacement.
     """
+
+    has_own_figures: ClassVar[bool] = True
 
     mean: Pose
     centre: Floats

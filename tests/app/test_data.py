@@ -152,6 +152,24 @@ def test_a_merged_set_has_the_draws_of_all_where_they_were(
     assert "merged from" in run(capsys, "data", "show", both.path)
 
 
+def test_smooth_draws_are_merged_where_they_are_as_smooth(first: DataSet, tmp_path: Path) -> None:
+    """The first set has none; they stay a split of their own, which its plan knows of."""
+    counts = {"train": 3, "validation": 2, "test": 2, "smooth": 3}
+    parts = [
+        made(tmp_path / str(seed), seed=seed, samples=counts, loads=replace(PLAN.loads, smoothness=length))
+        for seed, length in ((1, 0.1), (2, 0.1), (3, 0.2))
+    ]
+    both = merge([first, *parts[:2]], tmp_path / "both.zarr")
+    found, wanted = both.samples("smooth"), [part.samples("smooth") for part in parts[:2]]
+    np.testing.assert_array_equal(found.forces, np.concatenate([part.forces for part in wanted]))
+    learned = [each.samples("train").displacements for each in (first, *parts[:2])]
+    np.testing.assert_array_equal(both.samples("train").displacements, np.concatenate(learned))
+    plan = plan_from_header(both.header)
+    assert plan.loads.smoothness == 0.1 and plan.samples["smooth"] == 6
+    with pytest.raises(DataSetError, match=r"expected smooth draws of one correlation length .* got 0\.1 and 0\.2 m"):
+        merge([parts[0], parts[2]], tmp_path / "other.zarr")
+
+
 def test_a_merged_set_is_gone_on_with_as_far_as_nothing_is_drawn_anew(
     first: DataSet, second: DataSet, tmp_path: Path
 ) -> None:

@@ -12,9 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softtwin.app.config import Config, ConfigError, to_toml
-from softtwin.app.twin import Twin
+from softtwin.app.twin import Sequence, Twin
 from softtwin.meshes.clouds import CloudError
 from softtwin.registration.pose import Pose
+from softtwin.registration.residuals.landmarks import LandmarkPairs
 from softtwin.registration.verdict import Verdict
 
 from .conftest import pulled, seen_cloud
@@ -155,6 +156,27 @@ def test_a_stream_survives_clouds_that_cannot_be_used(plain_twin: Twin, forces) 
         assert len(frame.judgement.reasons) == 1 and (word in frame.judgement.reasons[0] or word == "far")
     assert frames[5].judgement.verdict is Verdict.ACCEPTED
     assert frames[5].registration.evaluations < frames[0].registration.evaluations  # it began where frame 0 ended
+
+
+@pytest.mark.parametrize("is_live", [False, True])
+def test_other_measurements_pull_in_a_stream_as_in_one_cloud(plain_twin: Twin, forces, is_live: bool) -> None:
+    cloud = seen_cloud(plain_twin, forces)
+    moved = plain_twin.body.points + plain_twin.predict(forces).displacement
+    observed = plain_twin.observed
+    places = observed.body.points[observed.nodes[:4]]
+    right = LandmarkPairs.of(observed, places, moved[observed.nodes[:4]], 1e-4)
+    wrong = LandmarkPairs.of(observed, places, moved[observed.nodes[:4]] + 0.01, 1e-4)
+    sequence = Sequence(plain_twin, is_live=is_live)
+    told = [sequence.register(cloud, terms=(term,)) for term in (right, right, wrong)]
+    sequence.close()
+    assert [frame.judgement.is_usable for frame in told[:2]] == [True, True]
+    for frame in told:
+        assert [term for term in frame.registration.problem.terms if isinstance(term, LandmarkPairs)]
+    assert told[2].judgement.verdict is not Verdict.ACCEPTED
+    one, pulled_off = (frame.registration.displacement for frame in told[1:])
+    assert np.linalg.norm(pulled_off - one, axis=1).max() > 2e-3
+    frames = list(plain_twin.stream([cloud, cloud], terms=(wrong,)))
+    assert all(frame.judgement.verdict is not Verdict.ACCEPTED for frame in frames)
 
 
 def test_one_bad_frame_does_not_spoil_those_after_it(plain_twin: Twin, forces) -> None:

@@ -80,6 +80,16 @@ class Growth(FieldBlock):
         return (estimate("growth", "", lambda c: self.amplitude * c, float(mean[0]), float(covariance[0, 0])),)
 
 
+class Tilt(FieldBlock):
+    """Two bends of which nothing is said beyond what they do."""
+
+    def __init__(self, observed: SurfaceDistance) -> None:
+        along = observed.body.points[:, 0]
+        modes = np.zeros((len(along), 3, 2))
+        modes[:, 1, 0], modes[:, 2, 1] = along, along
+        super().__init__(modes.reshape(-1, 2), observed, 0.01)
+
+
 def registrar(body: Body, *, pose: PosePrior | None = None, blocks: tuple[ParameterBlock, ...] = ()) -> Registrar:
     forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4))
     options = RegistrationOptions(localisation=SparseLocalisation(rounds=0))
@@ -185,6 +195,25 @@ def test_growth_is_found_beside_the_forces(body: Body, rng: np.random.Generator,
     assert (found.uncertainty.deviation > 0.0).sum() >= len(body.points) - 1  # the middle alone does not grow
     again = made.register(cloud_on(body, truth, 600, rng, NOISE), found)  # the next frame starts from it
     assert again.estimates[0].value == pytest.approx(growth.value, abs=0.002)
+
+
+def test_a_block_that_says_nothing_of_itself_is_told_and_checked(body: Body, rng: np.random.Generator) -> None:
+    """Each coefficient in deviations, under the name of its class; far off, it makes a result doubtful."""
+    observed = SurfaceDistance(body, body.surfaces["observed"])
+    made = registrar(body, blocks=(Tilt(observed),))
+    still = made.register(cloud_on(body, np.zeros_like(body.points), 600, rng, NOISE))
+    assert [known.name for known in still.estimates] == ["Tilt 1", "Tilt 2"]
+    assert {known.unit for known in still.estimates} == {"deviations"}
+    told = [each for each in still.judgement.checks if each.code is Code.PARAMETER]
+    assert [each.subject for each in told] == ["Tilt 1", "Tilt 2"] and all(each.is_passed for each in told)
+    tilted = np.zeros_like(body.points)
+    tilted[:, 2] = 0.08 * body.points[:, 0]
+    found = made.register(cloud_on(body, tilted, 600, rng, NOISE))
+    assert found.estimates[1].deviations > 3.0
+    assert [each.subject for each in found.judgement.checks if each.code is Code.PARAMETER and not each.is_passed] == [
+        "Tilt 2"
+    ]
+    assert found.judgement.verdict is not Verdict.ACCEPTED
 
 
 def test_growth_that_nobody_expects_is_doubtful(body: Body, rng: np.random.Generator) -> None:
