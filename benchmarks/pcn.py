@@ -70,7 +70,7 @@ class Law:
         local = found.local
         assert local is not None  # it was registered
         scale = 1.0 / np.sqrt(local.precision)
-        return cls(found.problem, found.evaluation, scale, local.own, local.deviations, loss or Tukey())
+        return cls(found.problem, found.evaluation, scale, local.point_noise, local.deviations, loss or Tukey())
 
     def log_likelihood(self, whitened: Floats) -> float:
         """Of coefficients over their scales beforehand, (k,), up to a constant."""

@@ -138,7 +138,7 @@ class GaussNewton:
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"GaussNewton.{name}: expected a positive number, got {getattr(self, name)}.")
 
-    def rough(self) -> GaussNewton:
+    def coarse(self) -> GaussNewton:
         """The same with the first loss alone, ended early: for a start."""
         few = min(self.max_iterations, ACCURACY.few_iterations)
         return replace(self, losses=self.losses[:1], settled=self.handed_on, max_iterations=few)
@@ -196,7 +196,7 @@ class _Search:
         self.evaluation = _begun(self.problem, start, near)
         self.evaluations, self.limit = 1, self._first_limit
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
-        self.own, self.begun, self.comparable = 0.0, 0, 0
+        self.point_noise, self.begun, self.comparable = 0.0, 0, 0
         self.takes_last = options.graduation > 0.0
         self.eta, self.starts = eta, list[Floats]()
         self.trace: list[IterationRecord] = []
@@ -245,7 +245,7 @@ class _Search:
         gain, size, length = gain_by_shared_noise(self._local(loss), self.whole)
         if not np.isfinite(gain):
             return False
-        before = self.problem, self._at, self.evaluation, self.noise, self.own, self.eta
+        before = self.problem, self._at, self.evaluation, self.noise, self.point_noise, self.eta
         self.problem, self._at = self.whole, None
         self.evaluation = replace(self.evaluation, coefficients=self.whole.sized(self.evaluation.coefficients))
         without = self._without()
@@ -253,7 +253,7 @@ class _Search:
         self.starts[1][[SHARED, LENGTH]] = size, length
         if self._local(loss).eta[SHARED] > 0.5 * (without[SHARED] + size):
             return True
-        self.problem, self._at, self.evaluation, self.noise, self.own, self.eta = before  # it fell back to none
+        self.problem, self._at, self.evaluation, self.noise, self.point_noise, self.eta = before  # it fell back to none
         return False
 
     def _without(self) -> Floats:
@@ -275,11 +275,11 @@ class _Search:
                 self.options.graduation,
                 at.jacobian if at is not None and is_there else None,
                 starts or [self._without()],
-                self.own,
+                self.point_noise,
                 is_held=is_held,
                 linearised_at=at.linearised_at if at is not None and is_there else None,
             )
-            self._at, self.noise, self.own, self.eta, self.starts = at, at.noise, at.own, at.eta, []
+            self._at, self.noise, self.point_noise, self.eta, self.starts = at, at.noise, at.point_noise, at.eta, []
         return at
 
     def _renewed(self, loss: Loss) -> LocalModel:
@@ -391,7 +391,7 @@ class _Search:
                 )
                 return None
         self.limit = self._first_limit
-        return Outcome.REFUSED if unsolved else Outcome.NO_DESCENT
+        return Outcome.NO_STATE if unsolved else Outcome.NO_DESCENT
 
 
 def _begun(problem: Problem, start: Floats, near: Evaluation | None) -> Evaluation:

@@ -48,7 +48,7 @@ def _by_hyperparameters(local: LocalModel) -> tuple[Floats, Floats]:
     """Derivative of the mean by the logarithms of the hyperparameters, (k, h), and their covariance, (h, h)."""
     _, slopes = local.problem.prior_variances(local.eta)
     columns = (slopes * (local.precision * local.evaluation.coefficients)).T
-    residuals = local.problem.residuals(local.evaluation, local.own)
+    residuals = local.problem.residuals(local.evaluation, local.point_noise)
     share = (local.noise / local.deviations) ** 2  # of a distance's variance that is its own noise
     weighted = local.weights * residuals / local.deviations**2
     columns[:, NOISE] = 2.0 * (share * weighted) @ local.jacobian

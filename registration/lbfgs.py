@@ -57,7 +57,7 @@ class LBFGS:
                 f"LBFGS.max_iterations, LBFGS.memory: expected at least 1, got {self.max_iterations} and {self.memory}."
             )
 
-    def rough(self) -> LBFGS:
+    def coarse(self) -> LBFGS:
         """The same with the first loss alone: for a start."""
         return replace(self, losses=self.losses[:1])
 
@@ -174,12 +174,12 @@ class _Run:
             return Outcome.CONVERGED
         if done.status == 1:
             return Outcome.MAXIMUM_ITERATIONS
-        return Outcome.REFUSED if met_wall else Outcome.NO_DESCENT
+        return Outcome.NO_STATE if met_wall else Outcome.NO_DESCENT
 
 
 def _objective(problem: Problem, evaluation: Evaluation, loss: Loss, local: LocalModel) -> tuple[float, Floats]:
     """Robust distances and their gradient by the coefficients, (k,), at the scales of a model."""
-    scaled = problem.residuals(evaluation, local.own) / local.deviations
+    scaled = problem.residuals(evaluation, local.point_noise) / local.deviations
     slope = loss.weight(scaled) * scaled / local.deviations
     value, gradient = float(loss.value(scaled).sum()), problem.vjp(evaluation, slope)
     held = local.evaluation.match

@@ -34,7 +34,7 @@ class LocalModel:
         graduation: the noise is taken as at least this part of what the linear model promises to change.
         jacobian: of the distances at the trial, (p, k), where it is known.
         starts: logarithms of hyperparameters that the search for them begins with; those that are believed if none.
-        own: the points' own noise so far, metres, without what is yet to be explained; None for all of it.
+        point_noise: the points' own noise so far, metres, without what is yet to be explained; None for all of it.
         is_held: the hyperparameters are the first of the starts, and not sought.
         linearised_at: trial nearby whose derivatives these are; this one if not given.
     """
@@ -48,21 +48,21 @@ class LocalModel:
         graduation: float = 0.0,
         jacobian: Floats | None = None,
         starts: Sequence[Floats] = (),
-        own: float | None = None,
+        point_noise: float | None = None,
         *,
         is_held: bool = False,
         linearised_at: Evaluation | None = None,
     ) -> None:
         self.problem, self.evaluation, self.loss = problem, evaluation, loss
         self.linearised_at = evaluation if linearised_at is None else linearised_at
-        self.is_undamped, self.own = True, noise if own is None else own
+        self.is_undamped, self.point_noise = True, noise if point_noise is None else point_noise
         self.jacobian = problem.jacobian(evaluation) if jacobian is None else jacobian
         told = [_told(problem, evaluation, term, loss) for term in problem.terms]
         self._by_terms = np.sum([each[0] for each in told], axis=0) if told else None
         self._beside: Floats | float = np.sum([each[1] for each in told], axis=0) if told else 0.0
-        self._groups, self.rough = _grouped(problem.rough(evaluation))
+        self._groups, self.local_error = _grouped(problem.local_error(evaluation))
         start = problem.hyperprior.within(starts[0]) if len(starts) else _believed(problem, noise)
-        self.counted: Floats  # weights that what the points tell is summed with, (p,)
+        self.evidence_weights: Floats  # weights that what the points tell is summed with, (p,)
         self.evidence = self._evidence_near(start, noise)
         if is_held:
             self.eta, self.is_graduated = start, False
@@ -70,12 +70,12 @@ class LocalModel:
             self.eta, self.is_graduated = self._found(graduation, list(starts) or [start])
         self.scales = Hyperparameters(*np.exp(self.eta))
         self.noise = self.scales.noise
-        self.deviations = np.hypot(self.noise, self.scales.discrepancy * self.rough)
-        residuals = problem.residuals(evaluation, self.own)
+        self.deviations = np.hypot(self.noise, self.scales.discrepancy * self.local_error)
+        residuals = problem.residuals(evaluation, self.point_noise)
         self.weights = loss.weight(residuals / self.deviations)
-        if np.abs(self.weights - self.counted).sum() > ACCURACY.summed * self.weights.sum():
+        if np.abs(self.weights - self.evidence_weights).sum() > ACCURACY.summed * self.weights.sum():
             summed = replace(self._evidence_of(residuals, self.weights).problem, tail=self.evidence.problem.tail)
-            self.evidence, self.counted = replace(self.evidence, problem=summed), self.weights
+            self.evidence, self.evidence_weights = replace(self.evidence, problem=summed), self.weights
         self.precision = np.exp(-problem.prior_variances(self.eta)[0])
         self._inform()
         self.gradient = self._gradient(residuals, self.weights)
@@ -98,10 +98,14 @@ class LocalModel:
             eta: logarithms of hyperparameters near those sought, (5,).
             noise: standard deviation of a point's distance, metres.
         """
-        residuals = self.problem.residuals(self.evaluation, self.own)
-        self.counted = self.loss.weight(residuals / np.hypot(noise, np.exp(eta[DISCREPANCY]) * self.rough))
-        found = self._evidence_of(residuals, self.counted)
-        left = self.counted * (residuals + self.jacobian @ (found.mean(eta) - self.evaluation.coefficients)) ** 2
+        residuals = self.problem.residuals(self.evaluation, self.point_noise)
+        self.evidence_weights = self.loss.weight(
+            residuals / np.hypot(noise, np.exp(eta[DISCREPANCY]) * self.local_error)
+        )
+        found = self._evidence_of(residuals, self.evidence_weights)
+        left = (
+            self.evidence_weights * (residuals + self.jacobian @ (found.mean(eta) - self.evaluation.coefficients)) ** 2
+        )
         tail = (1.0 / self.loss.consistency - 1.0) * np.array([left[group].sum() for group in self._groups])
         return replace(found, problem=replace(found.problem, tail=tail))
 
@@ -120,14 +124,14 @@ class LocalModel:
             np.zeros(len(groups)),
             known,
         )
-        there = np.array([self.rough[group[0]] for group in groups])
+        there = np.array([self.local_error[group[0]] for group in groups])
         return Evidence(linear, problem.noise_variances(there), problem.prior_variances, problem.hyperprior)
 
     def _found(self, graduation: float, starts: list[Floats]) -> tuple[Floats, bool]:
         """Logarithms of the hyperparameters, and whether the noise is held above what the model would believe."""
         evidence = self.evidence
         eta = evidence.maximum(starts)
-        self.own = float(np.exp(eta[NOISE]))
+        self.point_noise = float(np.exp(eta[NOISE]))
         minimum = np.log(max(graduation * self._promised(evidence, eta), 1e-300))
         if minimum <= eta[NOISE]:
             return eta, False
@@ -147,7 +151,7 @@ class LocalModel:
 
     @property
     def _root(self) -> Floats:
-        return np.sqrt(self.counted) / self.deviations
+        return np.sqrt(self.evidence_weights) / self.deviations
 
     def score_of(self, columns: Floats) -> tuple[Floats, Floats]:
         """Slope of the logarithm of the likelihood by parameters that are none here, (m,), and its covariance, (m, m).
@@ -157,7 +161,7 @@ class LocalModel:
         Args:
             columns: derivative of the distances by these parameters, (p, m).
         """
-        weighted, residuals = self._root[:, None] * columns, self.problem.residuals(self.evaluation, self.own)
+        weighted, residuals = self._root[:, None] * columns, self.problem.residuals(self.evaluation, self.point_noise)
         across = self.whitened.T @ weighted
         solved = self.solved(across)
         # What the last step, which was not taken, would still change of the residuals counts, too.
@@ -214,7 +218,7 @@ class LocalModel:
     def objective(self, evaluation: Evaluation, loss: Loss) -> float:
         """Robust distances and prior at these scales."""
         prior = 0.5 * float(self.precision @ evaluation.coefficients**2)
-        scaled = self.problem.residuals(evaluation, self.own) / self.deviations
+        scaled = self.problem.residuals(evaluation, self.point_noise) / self.deviations
         held = self.evaluation.match
         beside = sum(
             float((term.loss or loss).value(term.values(evaluation, held)).sum()) for term in self.problem.terms
@@ -228,7 +232,7 @@ class LocalModel:
 
     def length_for(self, evaluation: Evaluation) -> float:
         """The same at a trial of the same coefficients with other closest points, with these derivatives."""
-        residuals = self.problem.residuals(evaluation, self.own)
+        residuals = self.problem.residuals(evaluation, self.point_noise)
         gradient = self._gradient(residuals, self.loss.weight(residuals / self.deviations))
         return _length(self._whole_for(gradient), gradient)
 
@@ -238,7 +242,7 @@ class LocalModel:
         other.is_undamped = True
         for name in ("_whole", "value"):
             other.__dict__.pop(name, None)
-        residuals = self.problem.residuals(evaluation, self.own)
+        residuals = self.problem.residuals(evaluation, self.point_noise)
         other.evaluation, other.weights = evaluation, self.loss.weight(residuals / self.deviations)
         if self._by_terms is not None:
             other._beside = self._beside + self._by_terms @ (evaluation.coefficients - self.evaluation.coefficients)
@@ -295,14 +299,14 @@ def _believed(problem: Problem, noise: float) -> Floats:
     return problem.hyperprior.within(start)
 
 
-def _grouped(rough: Floats) -> tuple[list[NDArray[np.int64]], Floats]:
+def _grouped(local_error: Floats) -> tuple[list[NDArray[np.int64]], Floats]:
     """Points of like variance: numbers of those in each group, and the root mean square of it for each point, (p,)."""
-    if not rough.any():
-        return [np.arange(len(rough))], rough
-    groups = [group for group in np.array_split(np.argsort(rough), ACCURACY.groups) if len(group)]
-    alike = np.empty_like(rough)
+    if not local_error.any():
+        return [np.arange(len(local_error))], local_error
+    groups = [group for group in np.array_split(np.argsort(local_error), ACCURACY.groups) if len(group)]
+    alike = np.empty_like(local_error)
     for group in groups:
-        alike[group] = np.sqrt(np.mean(rough[group] ** 2))
+        alike[group] = np.sqrt(np.mean(local_error[group] ** 2))
     return groups, alike
 
 

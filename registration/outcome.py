@@ -10,7 +10,7 @@ class Outcome(Enum):
 
     CONVERGED = "converged"
     NO_DESCENT = "no step lowers the objective"
-    REFUSED = "the model finds no state further on"
+    NO_STATE = "the model finds no state further on"
     MAXIMUM_ITERATIONS = "most iterations reached"
     OUT_OF_TIME = "the time for it was over"
 
@@ -28,7 +28,7 @@ class Outcome(Enum):
 _ADVICE = {
     Outcome.CONVERGED: "nothing: a further step would move less than a fifth of what is uncertain.",
     Outcome.NO_DESCENT: "start from another frame's result or a better pose; look whether cloud and organ match.",
-    Outcome.REFUSED: "the forces that the cloud asks for leave what the model can solve: check pose and stiffness.",
+    Outcome.NO_STATE: "the forces that the cloud asks for leave what the model can solve: check pose and stiffness.",
     Outcome.MAXIMUM_ITERATIONS: "raise max_iterations, or start from the result of this frame.",
     Outcome.OUT_OF_TIME: "this is the best so far; allow more time a frame, or take a faster engine.",
 }

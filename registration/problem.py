@@ -65,7 +65,7 @@ class Problem(ParameterStack):
             terms: what pulls beside the cloud's distances, None as above.
         """
         given = [block for block in blocks if block is not None]
-        given += [block.rest for block in given if isinstance(block, ModelError)]
+        given += [block.remainder for block in given if isinstance(block, ModelError)]
         ordered = sorted(given, key=lambda block: (not block.is_moving, isinstance(block, CorrelatedNoise)))
         pulling = tuple(term for term in terms if term is not None)
         return cls(tuple(ordered), model, observed, cloud, noise, pulling)
@@ -82,16 +82,16 @@ class Problem(ParameterStack):
                 priors[place] = prior
         return Hyperprior.of(priors)
 
-    def noise_variances(self, rough: Floats) -> Variances:
+    def noise_variances(self, local_error: Floats) -> Variances:
         """Of points beside which the model's error changes from one to the next.
 
         Args:
-            rough: standard deviation of a distance by that, (g,), metres; see `rough`.
+            local_error: standard deviation of a distance by that, (g,), metres; see `local_error`.
         """
 
         def found(eta: Floats) -> tuple[Floats, Floats]:
-            own, beside = np.exp(2.0 * eta[NOISE]), np.exp(2.0 * eta[DISCREPANCY]) * rough**2
-            slopes = np.zeros((len(eta), len(rough)))
+            own, beside = np.exp(2.0 * eta[NOISE]), np.exp(2.0 * eta[DISCREPANCY]) * local_error**2
+            slopes = np.zeros((len(eta), len(local_error)))
             slopes[NOISE], slopes[DISCREPANCY] = 2.0 * own / (own + beside), 2.0 * beside / (own + beside)
             return np.log(own + beside), slopes
 
@@ -206,9 +206,9 @@ class Problem(ParameterStack):
             return np.zeros(len(self.cloud))
         return self.shared.explained(evaluation, evaluation.coefficients[self.part(CorrelatedNoise)])
 
-    def rough(self, evaluation: Evaluation) -> Floats:
+    def local_error(self, evaluation: Evaluation) -> Floats:
         """Standard deviation of each distance by what the model gets wrong from point to point, (p,), metres."""
-        return np.zeros(len(self.cloud)) if self.error is None else self.error.rest.rough(evaluation)
+        return np.zeros(len(self.cloud)) if self.error is None else self.error.remainder.local_error(evaluation)
 
     def slopes(self, evaluation: Evaluation) -> Slopes:
         """How the distances follow from what moves, and from what explains them."""

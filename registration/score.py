@@ -107,7 +107,7 @@ class _SharedNoise:
         assert problem.shared is not None
         self._modes, hyperprior = problem.shared.modes, problem.hyperprior
         pull, self._covariance = local.score_of(problem.shared.by_points(local.evaluation))
-        weights, scaled = local.weights, local.problem.residuals(local.evaluation, local.own) / local.deviations
+        weights, scaled = local.weights, local.problem.residuals(local.evaluation, local.point_noise) / local.deviations
         shrunk = float(np.sum((weights * scaled) ** 2) / max(weights.sum(), 1e-300))
         self._pull = pull / np.sqrt(max(shrunk, 1e-300))
         median, high = float(hyperprior.median[SHARED]), float(hyperprior.highest[SHARED])
@@ -120,7 +120,7 @@ class _SharedNoise:
 
     def _scaled(self, length: float) -> tuple[Floats, Floats]:
         """Slope and covariance by coefficients of unit variance, for the logarithm of a length."""
-        root = np.tile(np.exp(0.5 * self._modes.spread(np.exp(length))[0]), 3)
+        root = np.tile(np.exp(0.5 * self._modes.log_variances(np.exp(length))[0]), 3)
         return root * self._pull, root[:, None] * self._covariance * root
 
     def promised(self, length: float) -> float:

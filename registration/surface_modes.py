@@ -47,7 +47,7 @@ class SurfaceModes:
         """The smoothest so many."""
         return SurfaceModes(self.values[:count], self.modes[:, :count], self.area)
 
-    def spread(self, length: float, smoothness: float = 1.5) -> tuple[Floats, Floats]:
+    def log_variances(self, length: float, smoothness: float = 1.5) -> tuple[Floats, Floats]:
         """Logarithms of the modes' variances in a field of unit variance, and their derivatives by that of the length.
 
         Those of a smaller length than the modes show add up to less than 1: the rest is in the modes that are left out.
@@ -63,7 +63,7 @@ class SurfaceModes:
             ValueError: a length or a smoothness that is not positive.
         """
         if not (0.0 < length < np.inf and 0.0 < smoothness < np.inf):
-            raise ValueError(f"SurfaceModes.spread: expected positive numbers, got {length} and {smoothness}.")
+            raise ValueError(f"SurfaceModes.log_variances: expected positive numbers, got {length} and {smoothness}.")
         base = 2.0 * smoothness / length**2
         falling = -(smoothness + 1.0) * np.log(base + self.values)
         sloped = 2.0 * (smoothness + 1.0) * base / (base + self.values)

@@ -126,29 +126,29 @@ class ParameterBlock:
         """
         return 0.0, {}
 
-    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+    def jacobian(self, at: Evaluation, coefficients: Floats, slopes: Slopes) -> Floats:
         """Derivative of residuals by the coefficients, (q, c).
 
         Args:
             at: the problem at a trial.
-            own: the block's coefficients there, (c,).
+            coefficients: the block's coefficients there, (c,).
             slopes: how the residuals follow from what moves.
         """
         raise NotImplementedError
 
-    def vjp(self, at: Evaluation, own: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
+    def vjp(self, at: Evaluation, coefficients: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
         """The same, transposed and applied to a gradient by the residuals, (q,): (c,)."""
-        return cotangent @ self.jacobian(at, own, slopes)
+        return cotangent @ self.jacobian(at, coefficients, slopes)
 
-    def added(self, own: Floats) -> Floats | None:
+    def added(self, coefficients: Floats) -> Floats | None:
         """What it adds to the displacement of the observed nodes, (m, 3), metres; None for nothing."""
         return None
 
-    def field(self, own: Floats) -> Floats | None:
+    def field(self, coefficients: Floats) -> Floats | None:
         """The same of all nodes, (n, 3)."""
         return None
 
-    def explained(self, at: Evaluation, own: Floats) -> Floats | None:
+    def explained(self, at: Evaluation, coefficients: Floats) -> Floats | None:
         """The part of the cloud's distances that it explains, (p,), metres; None for nothing."""
         return None
 
@@ -160,7 +160,7 @@ class ParameterBlock:
         """Whether a change of the coefficients is more than one step may make, however little it moves."""
         return False
 
-    def full_columns(self, at: Evaluation, own: Floats) -> Floats | None:
+    def full_columns(self, at: Evaluation, coefficients: Floats) -> Floats | None:
         """Derivative of all nodes' displacement by the coefficients, (3n, c), body's axes; None where it moves none."""
         return None
 
@@ -226,28 +226,28 @@ class FieldBlock(ParameterBlock):
         """Number of fields."""
         return int(self.modes.shape[1])
 
-    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+    def jacobian(self, at: Evaluation, coefficients: Floats, slopes: Slopes) -> Floats:
         """See `ParameterBlock.jacobian`."""
         return self.amplitude * np.asarray(slopes.rows @ self.observed_modes)
 
-    def vjp(self, at: Evaluation, own: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
+    def vjp(self, at: Evaluation, coefficients: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
         """See `ParameterBlock.vjp`."""
         found: Floats = self.amplitude * ((slopes.rows.T @ cotangent) @ self.observed_modes)
         return found
 
-    def added(self, own: Floats) -> Floats:
+    def added(self, coefficients: Floats) -> Floats:
         """See `ParameterBlock.added`."""
-        return (self.observed_modes @ (self.amplitude * own)).reshape(-1, 3)
+        return (self.observed_modes @ (self.amplitude * coefficients)).reshape(-1, 3)
 
-    def field(self, own: Floats) -> Floats:
+    def field(self, coefficients: Floats) -> Floats:
         """See `ParameterBlock.field`."""
-        return (self.modes @ (self.amplitude * own)).reshape(-1, 3)
+        return (self.modes @ (self.amplitude * coefficients)).reshape(-1, 3)
 
     def moved(self, at: Evaluation, change: Floats, every: int) -> Floats:
         """See `ParameterBlock.moved`."""
         found: Floats = self.observed_modes.reshape(-1, 3, self.size)[::every] @ (self.amplitude * change)
         return found
 
-    def full_columns(self, at: Evaluation, own: Floats) -> Floats:
+    def full_columns(self, at: Evaluation, coefficients: Floats) -> Floats:
         """See `ParameterBlock.full_columns`."""
         return self.amplitude * self.modes

@@ -57,10 +57,10 @@ class CorrelatedNoise(ParameterBlock):
 
     def log_variances(self, eta: Floats) -> tuple[Floats, Mapping[int, Floats | float]]:
         """See `ParameterBlock.log_variances`."""
-        spread, by_length = self.modes.spread(float(np.exp(eta[LENGTH])))
+        spread, by_length = self.modes.log_variances(float(np.exp(eta[LENGTH])))
         return 2.0 * eta[SHARED] + np.tile(spread, 3), {SHARED: 2.0, LENGTH: np.tile(by_length, 3)}
 
-    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+    def jacobian(self, at: Evaluation, coefficients: Floats, slopes: Slopes) -> Floats:
         """See `ParameterBlock.jacobian`."""
         return self.by_points(at) if slopes.match is not None else np.zeros((slopes.rows.shape[0], self.size))
 
@@ -69,8 +69,8 @@ class CorrelatedNoise(ParameterBlock):
         modes = self.modes.at(at.observed.triangles[at.match.triangles], at.match.weights)
         return np.hstack([-along[:, None] * modes for along in at.match.directions.T])
 
-    def explained(self, at: Evaluation, own: Floats) -> Floats:
+    def explained(self, at: Evaluation, coefficients: Floats) -> Floats:
         """See `ParameterBlock.explained`."""
-        shifts = at.observed.vectors_at(at.match, self.modes.modes @ own.reshape(3, -1).T)
+        shifts = at.observed.vectors_at(at.match, self.modes.modes @ coefficients.reshape(3, -1).T)
         found: Floats = np.einsum("pi,pi->p", shifts, at.match.directions)
         return found

@@ -56,10 +56,10 @@ class ModelError(FieldBlock):
         return other
 
     @cached_property
-    def rest(self) -> RestOfModelError:
+    def remainder(self) -> RemainderOfModelError:
         """What the patterns leave out, as far as it is smooth."""
         deviation = np.sqrt(_COMPONENTS) * self.amplitude * self._left_out
-        return RestOfModelError(deviation, *self._rest_modes)
+        return RemainderOfModelError(deviation, *self._rest_modes)
 
     def hyperpriors(self, observed: SurfaceDistance) -> Mapping[int, LogNormalPrior]:
         """Of the discrepancy scale."""
@@ -89,7 +89,7 @@ class ModelError(FieldBlock):
         yield made if np.isfinite(level) else replace(made, level=None)
 
 
-class RestOfModelError(ParameterBlock):
+class RemainderOfModelError(ParameterBlock):
     """What the patterns of a model's error leave out, as far as neighbours share it: it explains distances.
 
     Args:
@@ -118,24 +118,24 @@ class RestOfModelError(ParameterBlock):
         """See `ParameterBlock.log_variances`."""
         return 2.0 * eta[DISCREPANCY] + self.logs, {DISCREPANCY: 2.0}
 
-    def rough(self, at: Evaluation) -> Floats:
+    def local_error(self, at: Evaluation) -> Floats:
         """Standard deviation of each distance by what the model gets wrong from point to point, (p,), metres.
 
         It changes over some edges of the mesh, less than points of a cloud lie apart.
         """
-        return at.once((self, "rough"), lambda: at.observed.at_points(at.match, self.deviation))
+        return at.once((self, "local error"), lambda: at.observed.at_points(at.match, self.deviation))
 
-    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+    def jacobian(self, at: Evaluation, coefficients: Floats, slopes: Slopes) -> Floats:
         """See `ParameterBlock.jacobian`."""
         match = slopes.match
         if match is None:
             return np.zeros((slopes.rows.shape[0], self.size))
         corners = at.observed.triangles[match.triangles]
-        return -self.rough(at)[:, None] * self.modes.at(corners, match.weights)
+        return -self.local_error(at)[:, None] * self.modes.at(corners, match.weights)
 
-    def explained(self, at: Evaluation, own: Floats) -> Floats:
+    def explained(self, at: Evaluation, coefficients: Floats) -> Floats:
         """See `ParameterBlock.explained`."""
-        return self.rough(at) * at.observed.at_vertices(at.match, self.modes.modes @ own)
+        return self.local_error(at) * at.observed.at_vertices(at.match, self.modes.modes @ coefficients)
 
 
 def _modes_of_rest(discrepancy: Discrepancy, observed: SurfaceDistance) -> tuple[SurfaceModes, Floats]:
@@ -149,7 +149,7 @@ def _modes_of_rest(discrepancy: Discrepancy, observed: SurfaceDistance) -> tuple
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     modes, nu = observed.modes, _SMOOTHNESS
     base = 4.0 * np.pi * nu**2 * discrepancy.places / ((2.0 * nu + 1.0) * area)
-    logs, _ = modes.spread(np.sqrt(2.0 * nu / base), nu)
+    logs, _ = modes.log_variances(np.sqrt(2.0 * nu / base), nu)
     carried = np.cumsum(np.exp(logs))
     kept = min(len(logs), 1 + int(np.searchsorted(carried, ACCURACY.carried)))
     return modes.leading(kept), logs[:kept]

@@ -187,7 +187,7 @@ class InputBlocks(ParameterBlock):
             begin = own.stop
         return tuple(found)
 
-    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+    def jacobian(self, at: Evaluation, coefficients: Floats, slopes: Slopes) -> Floats:
         """See `ParameterBlock.jacobian`."""
         return cast(ParametrisedState, at.state).rows_by_parameters(slopes.rows)
 
@@ -196,7 +196,7 @@ class InputBlocks(ParameterBlock):
         found: Floats = self.full_columns(at, change).reshape(-1, 3, self.size)[at.observed.nodes[::every]] @ change
         return found
 
-    def full_columns(self, at: Evaluation, own: Floats) -> Floats:
+    def full_columns(self, at: Evaluation, coefficients: Floats) -> Floats:
         """See `ParameterBlock.full_columns`."""
         return cast(ParametrisedState, at.state).by_parameters()
 

@@ -67,11 +67,11 @@ class NodalForces(ParameterBlock):
         """See `ParameterBlock.log_variances`."""
         return 2.0 * float(eta[SCALE]), {SCALE: 2.0}
 
-    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+    def jacobian(self, at: Evaluation, coefficients: Floats, slopes: Slopes) -> Floats:
         """See `ParameterBlock.jacobian`."""
         return at.state.jacobian(slopes.rows)
 
-    def vjp(self, at: Evaluation, own: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
+    def vjp(self, at: Evaluation, coefficients: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
         """See `ParameterBlock.vjp`: by the adjoint state."""
         full = np.zeros_like(at.observed.body.points)
         full[at.observed.nodes] = (slopes.rows.T @ cotangent).reshape(-1, 3)
@@ -82,7 +82,7 @@ class NodalForces(ParameterBlock):
         """See `ParameterBlock.moved`."""
         return at.state.moved(change, every)
 
-    def full_columns(self, at: Evaluation, own: Floats) -> Floats | None:
+    def full_columns(self, at: Evaluation, coefficients: Floats) -> Floats | None:
         """See `ParameterBlock.full_columns`."""
         return at.stiffness_scaling * at.state.full.jvp(self.basis) if self.size else None
 

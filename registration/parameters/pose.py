@@ -72,15 +72,15 @@ class PosePrior(ParameterBlock):
         """The centre of the turn where the expected pose puts it, (3,)."""
         return self.mean.apply(self.centre[None])[0]
 
-    def jacobian(self, at: Evaluation, own: Floats, slopes: Slopes) -> Floats:
+    def jacobian(self, at: Evaluation, coefficients: Floats, slopes: Slopes) -> Floats:
         """See `ParameterBlock.jacobian`.
 
         What the camera sees stays where it is: in the body's coordinates it moves against the pose.
         """
         along = slopes.along @ at.rotation.T  # in the camera's axes
-        found: Floats = np.einsum("pi,pij->pj", along, self.seen_jacobian(own, slopes.places))
+        found: Floats = np.einsum("pi,pij->pj", along, self.seen_jacobian(coefficients, slopes.places))
         if slopes.are_directions:
-            found -= np.einsum("pi,pij->pj", along, self.seen_jacobian(own, np.zeros_like(slopes.places)))
+            found -= np.einsum("pi,pij->pj", along, self.seen_jacobian(coefficients, np.zeros_like(slopes.places)))
         return found
 
     def moved(self, at: Evaluation, change: Floats, every: int) -> Floats:

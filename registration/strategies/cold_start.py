@@ -73,10 +73,10 @@ def from_rest(setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewt
         solver: that ends it.
     """
     few, first = points.thinned(setup.options.localisation.points), prepared.leading(ACCURACY.leading)
-    rough, problem = setup.plain(few, first).unshared, setup.plain(points, prepared)
-    begun = solver.rough().solve(rough, np.zeros(rough.size))
-    start = problem.carried(begun.evaluation.coefficients, rough)
-    start[: first.forces.size] = begun.evaluation.coefficients[rough.force_part]
+    coarse, problem = setup.plain(few, first).unshared, setup.plain(points, prepared)
+    begun = solver.coarse().solve(coarse, np.zeros(coarse.size))
+    start = problem.carried(begun.evaluation.coefficients, coarse)
+    start[: first.forces.size] = begun.evaluation.coefficients[coarse.force_part]
     if setup.is_hopeless(begun):  # what six directions leave as far off is no state of this organ
         solver = solver.without_steps()
     return after(begun, solver.solve(problem, start, begun.evaluation, begun.local.eta))

@@ -71,7 +71,9 @@ def independent(found: Registration) -> Registration:
     """The same with the posterior of the derivatives at its own state, not at the one a last short step before."""
     local = found.local
     assert local is not None
-    there = LocalModel(found.problem, found.evaluation, Square(), local.noise, starts=[local.eta], own=local.own)
+    there = LocalModel(
+        found.problem, found.evaluation, Square(), local.noise, starts=[local.eta], point_noise=local.point_noise
+    )
     return replace(found, solved=replace(found.solved, posterior=posterior(there), local=there))
 
 

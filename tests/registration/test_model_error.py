@@ -17,7 +17,7 @@ from softtwin.registration.local_model import LocalModel
 from softtwin.registration.loss import Square
 from softtwin.registration.options import options_for
 from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
-from softtwin.registration.parameters.discrepancy import ModelError, RestOfModelError
+from softtwin.registration.parameters.discrepancy import ModelError, RemainderOfModelError
 from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
@@ -154,7 +154,7 @@ def test_the_derivative_of_the_distances_is_exact(body: Body, rng) -> None:
     evaluation, direction, step = problem.evaluation(at), rng.standard_normal(problem.size), 1e-6
     moving = problem.moving.stop
     alone = problem.size - moving
-    assert moving == forces.size + 6 + 2 and alone == error.rest.size + 3 * 10
+    assert moving == forces.size + 6 + 2 and alone == error.remainder.size + 3 * 10
 
     def near(sign: float) -> Evaluation:
         return problem.evaluation(at + sign * step * direction, evaluation)
@@ -172,7 +172,7 @@ def test_the_derivative_of_the_distances_is_exact(body: Body, rng) -> None:
     taken = problem.residuals(replace(evaluation, coefficients=at + change), 1e-3)
     taken -= problem.residuals(evaluation, 1e-3)
     np.testing.assert_allclose(jacobian @ change, taken, rtol=1e-9, atol=1e-12)
-    assert np.abs(jacobian[:, problem.part(RestOfModelError)]).max() > 0.0
+    assert np.abs(jacobian[:, problem.part(RemainderOfModelError)]).max() > 0.0
     cotangent = rng.standard_normal(len(cloud))
     np.testing.assert_allclose(problem.vjp(evaluation, cotangent), jacobian.T @ cotangent, rtol=1e-8, atol=1e-10)
 
@@ -197,7 +197,7 @@ def test_margins_are_those_of_an_estimate_that_believed_the_model_too_much(
     believed[DISCREPANCY] = np.log(local.scales.margin_discrepancy)
     variances = np.exp(problem.prior_variances(believed)[0])
     unknown = np.sqrt(variances)[:, None] * rng.standard_normal((problem.size, 40_000))
-    noise = np.hypot(local.noise, local.rough)[:, None] * rng.standard_normal((len(cloud), 40_000))
+    noise = np.hypot(local.noise, local.local_error)[:, None] * rng.standard_normal((len(cloud), 40_000))
     data = (local.jacobian @ unknown + noise) / local.deviations[:, None] ** 2
     off = local.solved(local.jacobian.T @ data) - unknown
     wanted = np.cov(off)
@@ -205,6 +205,6 @@ def test_margins_are_those_of_an_estimate_that_believed_the_model_too_much(
     np.testing.assert_allclose(found, wanted, atol=0.04 * np.sqrt(np.outer(np.diag(wanted), np.diag(wanted))).max())
     assert (np.diag(found) > 0.999 * np.diag(local.solved(np.eye(problem.size)))).all()
     assert (
-        np.diag(found)[problem.part(RestOfModelError)].sum()
-        > 2.0 * 0.6**2 * variances[problem.part(RestOfModelError)].sum()
+        np.diag(found)[problem.part(RemainderOfModelError)].sum()
+        > 2.0 * 0.6**2 * variances[problem.part(RemainderOfModelError)].sum()
     )

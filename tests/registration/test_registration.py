@@ -123,7 +123,7 @@ def test_a_model_that_refuses_ends_refused_and_says_so(body: Body, rng) -> None:
     observed = SurfaceDistance(body, body.surfaces["observed"])
     timid = Registrar(Cantilever(body, refuse_above=0.5), observed, forces_of(body))
     result = timid.register(cloud_on(body, truth, 200, rng))
-    assert result.outcome is Outcome.REFUSED
+    assert result.outcome is Outcome.NO_STATE
     assert result.judgement.verdict.value != "accepted"
 
 

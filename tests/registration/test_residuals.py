@@ -137,7 +137,7 @@ def test_what_is_yet_to_be_explained_is_no_noise_of_the_points(body: Body, obser
     problem = Problem.of(model, observed, cloud, LogNormalPrior(1e-3, 1.5), (forces,))
     rest = problem.evaluation(np.zeros(forces.size))
     local = LocalModel(problem, rest, Huber(), rest.match.rms, graduation=1.0)
-    assert local.is_graduated and local.own < 0.5 * local.noise
+    assert local.is_graduated and local.point_noise < 0.5 * local.noise
 
 
 def test_closest_points_are_the_closest(body: Body, observed: SurfaceDistance, rng) -> None:

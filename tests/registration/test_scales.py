@@ -146,8 +146,8 @@ def test_without_data_the_posterior_is_the_prior(body: Body, rng: np.random.Gene
     assert not local.weights.any()
     found, hyperprior = posterior(local), given.hyperprior
     np.testing.assert_allclose(local.eta, hyperprior.median, atol=0.05)
-    shared = POLICY.shared_size**2 * np.exp(observed.modes.spread(local.scales.length)[0])
-    variances = [np.full(given.forces.size, 0.05**2), np.ones(6 + 2), np.exp(error.rest.logs), np.tile(shared, 3)]
+    shared = POLICY.shared_size**2 * np.exp(observed.modes.log_variances(local.scales.length)[0])
+    variances = [np.full(given.forces.size, 0.05**2), np.ones(6 + 2), np.exp(error.remainder.logs), np.tile(shared, 3)]
     np.testing.assert_allclose(np.diag(found.covariance), np.concatenate(variances), rtol=0.02)
     off = found.covariance - np.diag(np.diag(found.covariance))
     np.testing.assert_allclose(off, 0.0, atol=1e-12)
@@ -156,7 +156,7 @@ def test_without_data_the_posterior_is_the_prior(body: Body, rng: np.random.Gene
 
 def dense_evidence(local: LocalModel, force: float) -> float:
     """Minus the logarithm of the normal law of all points for a force scale, with its prior, but for a constant."""
-    data = local.jacobian @ local.evaluation.coefficients - local.problem.residuals(local.evaluation, local.own)
+    data = local.jacobian @ local.evaluation.coefficients - local.problem.residuals(local.evaluation, local.point_noise)
     covariance = local.noise**2 * np.eye(len(data)) + force**2 * local.jacobian @ local.jacobian.T
     scale = local.problem.forces.scale
     believed = (np.log(force / scale.median) / scale.spread) ** 2
@@ -183,7 +183,7 @@ def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(body: Body, rng: np.ra
     def mean(scale: float) -> Floats:
         forces = replace(local.problem.forces, scale=LogNormalPrior(scale, 0.0))
         known = local.problem.with_forces(forces)
-        held = LocalModel(known, local.evaluation, Square(), local.noise, own=local.own)
+        held = LocalModel(known, local.evaluation, Square(), local.noise, point_noise=local.point_noise)
         return held.evaluation.coefficients - held.solved(held.gradient[:, None])[:, 0]
 
     slope = (mean(force * np.exp(1e-4)) - mean(force * np.exp(-1e-4))) / 2e-4

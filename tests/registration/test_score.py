@@ -111,11 +111,11 @@ def test_nothing_is_said_of_what_is_not_seen(registrar: Registrar) -> None:
 
 def evidence_with(local: LocalModel, problem: Problem, size: float, length: float) -> float:
     """Logarithm of the dense normal law of the distances with noise of a size and length that neighbours share."""
-    data = local.jacobian @ local.evaluation.coefficients - local.problem.residuals(local.evaluation, local.own)
+    data = local.jacobian @ local.evaluation.coefficients - local.problem.residuals(local.evaluation, local.point_noise)
     covariance = np.diag(local.deviations**2) + local.jacobian / local.precision @ local.jacobian.T
     assert problem.shared is not None
     modes = problem.shared.by_points(local.evaluation)
-    covariance += size**2 * modes * np.exp(np.tile(problem.shared.modes.spread(length)[0], 3)) @ modes.T
+    covariance += size**2 * modes * np.exp(np.tile(problem.shared.modes.log_variances(length)[0], 3)) @ modes.T
     return -0.5 * float(np.linalg.slogdet(covariance)[1] + data @ np.linalg.solve(covariance, data))
 
 

@@ -45,7 +45,7 @@ def test_modes_have_mean_square_one_and_share_nothing(modes: SurfaceModes) -> No
 def test_a_field_has_materns_covariance_within_the_surface(modes: SurfaceModes, length: float) -> None:
     """(1 + sqrt(3) d / l) exp(-sqrt(3) d / l) between points that lie far from the edges."""
     points, _ = rectangle()
-    variances = np.exp(modes.spread(length)[0])
+    variances = np.exp(modes.log_variances(length)[0])
     middle = int(np.argmin(np.linalg.norm(points - [WIDTH / 2.0, HEIGHT / 2.0, 0.0], axis=1)))
     found = modes.modes @ (variances * modes.modes[middle])
     found /= found[middle]  # near the edges, that reflect it, the field varies more, so that it does less here
@@ -59,19 +59,19 @@ def test_a_field_has_materns_covariance_within_the_surface(modes: SurfaceModes, 
 def test_variances_add_up_to_one_with_what_is_left_out(modes: SurfaceModes) -> None:
     whole = surface_modes(*rectangle(), 500)
     for length in (0.01, 0.03):
-        few, many = (np.exp(each.spread(length)[0]).sum() for each in (modes, whole))
+        few, many = (np.exp(each.log_variances(length)[0]).sum() for each in (modes, whole))
         assert few < many < 1.0
         np.testing.assert_allclose(
-            np.exp(whole.spread(length)[0][:120]).sum(), few, rtol=0.15
+            np.exp(whole.log_variances(length)[0][:120]).sum(), few, rtol=0.15
         )  # Weyl's law, without its term for the edges
-    assert np.exp(modes.spread(0.1)[0]).sum() == pytest.approx(1.0, abs=0.01)
+    assert np.exp(modes.log_variances(0.1)[0]).sum() == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("smoothness", [0.5, 1.5])
 def test_the_derivative_by_the_length_is_exact(modes: SurfaceModes, smoothness: float) -> None:
     step = 1e-6
-    up, down = (modes.spread(0.03 * np.exp(sign * step), smoothness)[0] for sign in (1.0, -1.0))
-    np.testing.assert_allclose(modes.spread(0.03, smoothness)[1], (up - down) / (2.0 * step), atol=1e-7)
+    up, down = (modes.log_variances(0.03 * np.exp(sign * step), smoothness)[0] for sign in (1.0, -1.0))
+    np.testing.assert_allclose(modes.log_variances(0.03, smoothness)[1], (up - down) / (2.0 * step), atol=1e-7)
 
 
 def test_values_at_points_are_linear_between_vertices(modes: SurfaceModes, rng: np.random.Generator) -> None:
@@ -103,4 +103,4 @@ def test_what_is_no_surface_and_no_length_is_refused() -> None:
     with pytest.raises(ValueError, match="one place alone"):
         surface_modes(np.zeros_like(points), triangles, 4)
     with pytest.raises(ValueError, match=r"expected positive numbers, got 0\.0"):
-        surface_modes(points, triangles, 4).spread(0.0)
+        surface_modes(points, triangles, 4).log_variances(0.0)
