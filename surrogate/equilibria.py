@@ -7,15 +7,18 @@ solver in torch DiffEn).
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from softtwin.meshes.body import Body
-from softtwin.reference.data.materials import Material
+from softtwin.reference.data.materials import Material, Parameter, with_parameters
 
 from .residual import ElasticBody
 from .tangents import Factors, LayeredMatrices, layers_of
@@ -138,13 +141,17 @@ class Equilibria:
         of_cells = torch.from_numpy(numbers).to(self.device)[self.elastic.cells].flatten(1)
         self._matrices = LayeredMatrices(of_cells, np.repeat(layers[free], 3))
         self._warping = None if material.is_linear else Warping(self.elastic, layers)
+        self._stiffen()
+
+    def _stiffen(self) -> None:
+        """What depends on the material: the stiffness at no load with its factors, and how large rounding is."""
         self._rest = self._matrices.assembled(self.elastic.cell_stiffnesses(self._field(1)))
         self._at_rest = self._matrices.factor(self._rest)
         # F is 1 + grad u: an energy density is rounded as its terms are, which are as large as the moduli.
         unit = torch.eye(3, dtype=self.dtype, device=self.device).expand(*self.elastic.volumes.shape, 3, 3)
         self._epsilon = torch.finfo(self.dtype).eps
         stiffest = self.elastic.moduli(unit).amax(dim=(2, 3, 4, 5))
-        nodes, volume = len(body.points), float(self.elastic.volumes.sum())
+        nodes, volume = len(self.body.points), float(self.elastic.volumes.sum())
         self._force_scale = float(stiffest.max()) * (volume / nodes) ** (2 / 3) * nodes**0.5
         self._stiffness_scale = float(self._rest.abs().max())
         self._noise = _EPSILONS * self._epsilon * float((stiffest * self.elastic.volumes).sum())
@@ -153,6 +160,38 @@ class Equilibria:
                 "Equilibria.body: expected a body that something holds; its stiffness at no load has directions that "
                 "cost no energy."
             )
+
+    def with_parameters(self, **values: Parameter) -> Equilibria:
+        """The same body of the same law with other parameters.
+
+        Args:
+            values: numbers, or one for each cell, by the parameters' names; others stay.
+
+        Raises:
+            ValueError: a parameter that the law does not have, or values out of their range.
+        """
+        unknown = values.keys() - self.material.parameters.keys()
+        if unknown:
+            raise ValueError(
+                f"Equilibria.with_parameters: expected parameters among {sorted(self.material.parameters)}, "
+                f"got {sorted(unknown)}."
+            )
+        other = copy.copy(self)
+        other.material = with_parameters(self.material, values)
+        other.elastic = self.elastic.with_material(other.material)
+        other._stiffen()
+        return other
+
+    def tangent(self, displacement: ArrayLike | Tensor) -> Tangent:
+        """What equilibria change by, to first order.
+
+        Args:
+            displacement: of the equilibria, (s, n, 3), metres.
+
+        Raises:
+            ValueError: another shape, or numbers that are not finite.
+        """
+        return Tangent(self, self._checked("displacement", displacement))
 
     def _field(self, count: int) -> Tensor:
         return torch.zeros(count, self.elastic.nodes, 3, dtype=self.dtype, device=self.device)
@@ -323,3 +362,48 @@ class Equilibria:
             length[left] = torch.minimum(torch.maximum(wanted, 0.1 * step), 0.5 * step)
             left = left[~is_good & (length[left] > _SHORTEST)]
         return best, is_better
+
+
+class Tangent:
+    """Tangents at equilibria, whose inverse is the derivative of displacements by forces: symmetric, its own transpose.
+
+    Where an equilibrium is not stable the tangent is indefinite, and has a factor on the processor in its place.
+
+    Args:
+        solver: of the equilibria.
+        displacement: of these, (s, n, 3), metres.
+    """
+
+    def __init__(self, solver: Equilibria, displacement: Tensor) -> None:
+        self.solver, self.displacement = solver, displacement
+        entries = solver._matrices.assembled(solver.elastic.cell_stiffnesses(displacement))
+        self._factors = solver._matrices.factor(entries)
+        self.is_stable: Tensor = self._factors.is_positive
+
+    def inverse(self, columns: ArrayLike | Tensor) -> Tensor:
+        """The tangents' inverses times nodal columns, (s, n, 3, k) of each state: forces to displacements, and so back.
+
+        What columns have at held nodes is not looked at, and nothing comes out there.
+
+        Raises:
+            RuntimeError: an equilibrium at a bifurcation, where the tangent is singular.
+        """
+        solver = self.solver
+        columns = torch.as_tensor(columns, dtype=solver.dtype, device=solver.device)
+        count = columns.shape[3]
+        free = columns[:, solver._free].reshape(len(columns), -1, count)
+        found = self._factors.solve(free)
+        for wrong in torch.nonzero(~self.is_stable)[:, 0].tolist():
+            solved = self._indefinite[wrong].solve(free[wrong].double().cpu().numpy())
+            found[wrong] = torch.from_numpy(solved).to(found)
+        whole = torch.zeros_like(columns)
+        return whole.index_copy(1, solver._free, found.reshape(len(columns), -1, 3, count))
+
+    @cached_property
+    def _indefinite(self) -> dict[int, SuperLU]:
+        """LU factors of the tangents that are not positive definite, by their number."""
+        places = (3 * self.solver._free[:, None].cpu().numpy() + np.arange(3)).ravel()
+        return {
+            wrong: splu(self.solver.elastic.stiffness(self.displacement[wrong])[places][:, places].tocsc())
+            for wrong in torch.nonzero(~self.is_stable)[:, 0].tolist()
+        }

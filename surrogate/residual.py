@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 
 import numpy as np
@@ -69,14 +70,40 @@ class ElasticBody(nn.Module):
         is_free = np.ones((self.nodes, 1))
         is_free[body.fixed] = 0.0
         self.register_buffer("free", torch.from_numpy(is_free))
+        for name, values in self._named(material).items():
+            self.register_buffer(name, values)
+
+    def _named(self, material: Material) -> dict[str, Tensor]:
+        """Parameters of a law by the names of their buffers, (1, 1) or (cells, 1)."""
+        count, found = len(self.cells), {}
         for name, value in material.parameters.items():
             values = np.asarray(value, dtype=np.float64)
-            if values.shape not in ((), (len(body.cells),)):
+            if values.shape not in ((), (count,)):
                 raise ValueError(
-                    f"ElasticBody.material.{name}: expected a number or one for each of the {len(body.cells)} cells, "
+                    f"ElasticBody.material.{name}: expected a number or one for each of the {count} cells, "
                     f"got shape {values.shape}."
                 )
-            self.register_buffer(f"parameter_{name}", torch.from_numpy(values.reshape(-1, 1).copy()))
+            found[f"parameter_{name}"] = torch.from_numpy(values.reshape(-1, 1).copy())
+        return found
+
+    def with_material(self, material: Material) -> ElasticBody:
+        """The same with other parameters of the same law.
+
+        Args:
+            material: of that law.
+
+        Raises:
+            ValueError: another law, or parameters of another shape.
+        """
+        if type(material) is not type(self.material):
+            raise ValueError(
+                f"ElasticBody.with_material: expected a {type(self.material).__name__}, got {type(material).__name__}."
+            )
+        other = copy.copy(self)
+        values = {name: value.to(self.gradients) for name, value in self._named(material).items()}
+        other._buffers = {**self._buffers, **values}
+        other.material = material
+        return other
 
     def _check(self, name: str, field: Tensor) -> None:
         if not isinstance(field, Tensor):
@@ -181,8 +208,15 @@ class ElasticBody(nn.Module):
 
     def density(self, F: Tensor) -> Tensor:
         """Strain energy of deformation gradients, (..., 3, 3), joules a cubic metre, (...)."""
-        named = {name: getattr(self, f"parameter_{name}") for name in self.material.parameters}
-        density: Tensor = self.material.energy(
-            F, None, SimpleNamespace(**named), TorchAlgebra(F, self.minimum_jacobian)
-        )
+        return self.density_of(F, {name: getattr(self, f"parameter_{name}") for name in self.material.parameters})
+
+    def density_of(self, F: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """The same of other parameters of the law, each (1, 1) or (cells, 1)."""
+        algebra = TorchAlgebra(F, self.minimum_jacobian)
+        density: Tensor = self.material.energy(F, None, SimpleNamespace(**parameters), algebra)
         return density
+
+    def energy_of(self, displacement: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Strain energy of all states together, joules, as a function of displacements and parameters."""
+        F = self.deformation_gradients(displacement)
+        return (self.density_of(F, parameters) * self.volumes).sum()

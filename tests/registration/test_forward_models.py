@@ -1,4 +1,4 @@
-"""One suite over all forward models: the reference, from rest and from a network, and two networks, of the same beam.
+"""One suite over all forward models: the reference, from rest and from a network, torch's solver, and two networks.
 
 The thesis's perceptron is the yardstick: it vanishes nowhere by construction and has kinks between its linear pieces.
 Tests of what it cannot do name the models that they are for.
@@ -22,13 +22,15 @@ from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.generate import Plan, generate
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 from softtwin.registration.forward import ForwardModel
+from softtwin.surrogate.equilibria import Equilibria
+from softtwin.surrogate.equilibria_model import EquilibriaModel
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
 
 pytestmark = pytest.mark.fenicsx
-ALL, EXACT = ("reference", "hybrid", "reduced", "mlp"), ("reference", "hybrid", "reduced")
+ALL, EXACT = ("reference", "hybrid", "torch", "reduced", "mlp"), ("reference", "hybrid", "torch", "reduced")
 PLAN = Plan(loads=LoadPlan(modes=6, displacement=0.1), samples={"train": 32, "validation": 4, "test": 4}, block=4)
 
 
@@ -47,6 +49,9 @@ _NETWORKS = {"reduced": Reduced(modes=16, width=32), "mlp": Perceptron()}
 def model(request: pytest.FixtureRequest, data: DataSet) -> Iterator[ForwardModel]:
     if request.param in _NETWORKS:
         yield train(data, TrainingPlan(_NETWORKS[request.param], epochs=EPOCHS))
+        return
+    if request.param == "torch":
+        yield EquilibriaModel(Equilibria(data.body, PLAN.build_material()))
         return
     predictor = train(data, TrainingPlan(_NETWORKS["reduced"], epochs=EPOCHS)) if request.param == "hybrid" else None
     with Problem(data.body, PLAN.build_material(), NewtonOptions(tolerance=1e-11)) as problem:
