@@ -275,9 +275,10 @@ class RegistrationSection(Section):
 
     group: ClassVar[str] = "solver"
 
-    model: Literal["surrogate", "reference", "hybrid"] = option(
+    model: Literal["surrogate", "reference", "hybrid", "torch"] = option(
         "surrogate",
-        "which forward model registers; hybrid: the surrogate first, the reference from there",
+        "which forward model registers; hybrid: the surrogate first, the reference from there; torch: equilibria like "
+        "the reference's, solved without FEniCSx",
         basic=True,
         old=("engine",),
     )
@@ -427,9 +428,11 @@ class RegistrationSection(Section):
         kinds, others = [each.kind for each in named], [each for each in named if each.is_input]
         if "contact" in kinds and len(kinds) > 1:
             raise ValueError(f"registration.parameters: expected contact alone, got {', '.join(self.parameters)}")
-        models = ["surrogate", "reference"] if "contact" in kinds else ["surrogate", "reference", "hybrid"]
+        models = ["surrogate", "reference", "hybrid", "torch"]
+        if "contact" in kinds:
+            models.remove("hybrid")
         if others:  # a network has learned one material
-            models = ["reference", "hybrid"]
+            models = ["reference", "hybrid", "torch"]
         if self.known_forces:  # they are added to those that the network is asked for, where both engines know of them
             models = [model for model in models if model != "surrogate"]
         if any(self.gravity) or self.pressure or "moved" in kinds or self.forces == "known":

@@ -48,6 +48,8 @@ from .scenario import Scenario
 from .workspace import open_workspace
 
 if TYPE_CHECKING:
+    from softtwin.reference.data.materials import Material
+    from softtwin.surrogate.equilibria_model import EquilibriaModel
     from softtwin.surrogate.error_bound import ErrorBound, ErrorEstimator
     from softtwin.surrogate.loaded import LoadedSurrogate
     from softtwin.surrogate.model import Surrogate, SurrogateState
@@ -59,6 +61,7 @@ Engine = Registrar | HybridRegistrar | ContactRegistrar
 MODEL_ERROR = "model_error.npz"  # in a twin: covariance of its model-error ensemble
 # Of a pose of which nothing is believed: radians, body sizes. With two thirds or twice as much margins change by 2 %.
 _OPEN_ROTATION, _OPEN_TRANSLATION = float(np.deg2rad(30.0)), 0.2
+_TOLERANCE, _ITERATIONS = 1e-5, 15  # of Newton's method in registration, relative to the load
 FORMER_MODEL_ERROR = "doubt.npz"  # the name of that file before
 Camera = Pose | PosePrior | Literal["align"] | None
 """Where the camera stands: a known pose, one that is an unknown near an expected one, `align` for an unknown one that
@@ -130,7 +133,7 @@ class Twin:
 
         Args:
             folder: a twin; a folder with a body and its configuration, without a network; or a configuration file.
-            model: `surrogate`, `reference` or `hybrid`; what the twin's configuration says if not given.
+            model: `surrogate`, `reference`, `hybrid` or `torch`; what the twin's configuration says if not given.
             options: entries of the configuration's [registration] that replace what it says (`noise=1e-3`, ...).
 
         Raises:
@@ -750,7 +753,7 @@ def forward_models(
     """The forward model that registers, and a faster one that registers first where the engine is hybrid.
 
     Args:
-        name: `surrogate`, `reference` (where FEniCSx is installed) or `hybrid`.
+        name: `surrogate`, `reference` (where FEniCSx is installed), `hybrid` or `torch`.
         folder: the twin.
         body: its body.
         config: its configuration; gives the reference its material.
@@ -761,11 +764,12 @@ def forward_models(
     """
     network, known = None, known_model_error(folder, body, config)
     further = None if known is None else known[0]
-    if name != "reference":
+    if name in ("surrogate", "hybrid"):
         if not (folder / "surrogate.json").is_file():
             raise ConfigError(
                 f"twin: expected a surrogate in {folder}, found no surrogate.json; train one with `softtwin build`, "
-                "or register with the reference (--model reference), which needs the body alone, and FEniCSx."
+                "or register with the body alone by equilibria (--model reference, which needs FEniCSx, or --model "
+                "torch)."
             )
         from softtwin.surrogate.twin import load  # torch is needed here alone
 
@@ -779,10 +783,8 @@ def forward_models(
         yield network, None
         return
     from softtwin.reference.data.materials import MATERIALS
-    from softtwin.reference.derivatives.model import ReferenceModel  # FEniCSx is needed here alone
-    from softtwin.reference.solve.problem import NewtonOptions, Problem
 
-    scenario, options = Scenario.of(config), NewtonOptions(tolerance=1e-5, max_iterations=15)
+    scenario = Scenario.of(config)
     strange = sorted(scenario.held.keys() - body.node_sets.keys())
     if strange:
         raise ConfigError(
@@ -797,9 +799,27 @@ def forward_models(
         fast = _loaded(network, loading.forces)
     modulus = scenario.modulus(config.material.young_modulus, body)
     material = MATERIALS[config.material.law](modulus, config.material.poisson_ratio)
+    if name == "torch":
+        yield _solved_in_torch(body, material, loading.forces, further), None
+        return
+    from softtwin.reference.derivatives.model import ReferenceModel  # FEniCSx is needed here alone
+    from softtwin.reference.solve.problem import NewtonOptions, Problem
+
+    options = NewtonOptions(tolerance=_TOLERANCE, max_iterations=_ITERATIONS)
     with Problem(body, material, options, held=scenario.held) as problem:
         model = ReferenceModel(problem, patient=False, loading=loading, predictor=fast, discrepancy=further)
         yield model, fast
+
+
+def _solved_in_torch(
+    body: Body, material: Material, known: ArrayLike | None, further: Discrepancy | None
+) -> EquilibriaModel:
+    """Equilibria in torch, in double precision on the processor."""
+    from softtwin.surrogate.equilibria import Equilibria, NewtonSettings  # torch is needed here alone
+    from softtwin.surrogate.equilibria_model import EquilibriaModel
+
+    settings = NewtonSettings(tolerance=_TOLERANCE, iterations=_ITERATIONS)
+    return EquilibriaModel(Equilibria(body, material, settings=settings), known, discrepancy=further, patient=False)
 
 
 def _loaded(network: Surrogate, known: ArrayLike) -> LoadedSurrogate:

@@ -204,12 +204,15 @@ class Equilibria:
         """The field that is zero where nodes are held, (s, n, 3)."""
         return self._field(len(values)).index_copy(1, self._free, values.reshape(len(values), len(self._free), 3))
 
-    def solve(self, forces: ArrayLike | Tensor, start: ArrayLike | Tensor | None = None) -> States:
+    def solve(
+        self, forces: ArrayLike | Tensor, start: ArrayLike | Tensor | None = None, *, load_steps: int | None = None
+    ) -> States:
         """States under loads; each in one step where that succeeds, else in 2, 4, ... parts of the load.
 
         Args:
             forces: nodal forces, (s, n, 3), newtons; none at held nodes.
             start: displacements to begin at, (s, n, 3), metres; none if not given.
+            load_steps: parts of a load, at most; as the settings say if not given.
 
         Raises:
             ValueError: another shape, numbers that are not finite, or forces on held nodes, where they would be lost.
@@ -221,9 +224,9 @@ class Equilibria:
         begin = None
         if start is not None:
             begin = self._spread(self._picked(self._checked("start", start)))
-        size = self.settings.chunk or self._chunk()
+        size, most = self.settings.chunk or self._chunk(), load_steps or self.settings.load_steps
         parts = [
-            self._solved(loads[i : i + size], None if begin is None else begin[i : i + size])
+            self._solved(loads[i : i + size], None if begin is None else begin[i : i + size], most)
             for i in range(0, max(len(loads), 1), size)
         ]
         if len(parts) == 1:
@@ -231,6 +234,8 @@ class Equilibria:
         return States(*(torch.cat([getattr(part, item.name) for part in parts]) for item in fields(States)))
 
     def _checked(self, name: str, field: ArrayLike | Tensor) -> Tensor:
+        if isinstance(field, np.ndarray) and not field.flags.writeable:
+            field = field.copy()  # torch knows no arrays that must not be written to, and says so
         field = torch.as_tensor(field, dtype=self.dtype, device=self.device)
         if field.ndim != 3 or field.shape[1:] != (self.elastic.nodes, 3) or not len(field):
             raise ValueError(
@@ -248,12 +253,12 @@ class Equilibria:
         free = torch.cuda.mem_get_info(self.device)[0] // 4 if self.device.type == "cuda" else 2**28
         return max(1, int(free // state))
 
-    def _solved(self, loads: Tensor, begin: Tensor | None) -> States:
+    def _solved(self, loads: Tensor, begin: Tensor | None, most: int) -> States:
         start = self._starts(loads) if begin is None else begin
         found = self._newton(loads, start)
         origin = torch.zeros_like(start) if begin is None else begin
         steps, parts = torch.ones_like(found.iterations), 2
-        while parts <= self.settings.load_steps and not bool(found.is_converged.all()):
+        while parts <= most and not bool(found.is_converged.all()):
             missing = torch.nonzero(~found.is_converged)[:, 0]
             now = origin[missing]
             count = torch.zeros_like(missing)

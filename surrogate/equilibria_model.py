@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from softtwin.meshes.body import Body
+from softtwin.reference.data.discrepancy import Discrepancy
 from softtwin.reference.data.inputs import Change, Inputs
 from softtwin.reference.data.loading import checked_array
 from softtwin.reference.data.outcome import NotConverged
@@ -29,12 +30,21 @@ class EquilibriaModel:
     Args:
         solver: body, material, device and precision.
         forces: nodal forces that act at all times beside those that are asked for, (n, 3), newtons; none if not given.
+        discrepancy: what is not known of the organ, as patterns that the model may be wrong by.
+        patient: try load steps, and from rest, where the state to start from is too far; False refuses at once, for a
+            search that can shorten its step.
     """
 
-    discrepancy = None
-
-    def __init__(self, solver: Equilibria, forces: ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        solver: Equilibria,
+        forces: ArrayLike | None = None,
+        *,
+        discrepancy: Discrepancy | None = None,
+        patient: bool = True,
+    ) -> None:
         self.solver = self._last = solver
+        self.discrepancy, self.patient = discrepancy, patient
         shape = solver.body.points.shape
         self._always = np.zeros(shape) if forces is None else checked_array("EquilibriaModel.forces", forces, shape)
 
@@ -80,12 +90,12 @@ class EquilibriaModel:
         load[self.body.fixed] = 0.0
         found = None
         if near is not None:
-            found = solver.solve(load[None], self._start(solver, load, near)[None])
-        if found is None or not bool(found.is_converged[0]):
+            found = solver.solve(load[None], self._start(solver, load, near)[None], load_steps=1)
+        if found is None or (self.patient and not bool(found.is_converged[0])):
             found = solver.solve(load[None])
         if not bool(found.is_converged[0]):
             raise NotConverged(
-                f"EquilibriaModel.solve: no equilibrium was found in {solver.settings.load_steps} load steps; "
+                f"EquilibriaModel.solve: no equilibrium was found in {int(found.load_steps[0])} load steps; "
                 f"out-of-balance forces are {float(found.residual[0]):.1e} of the load's. The load may be too "
                 "large: try a smaller one."
             )
@@ -134,7 +144,7 @@ class EquilibriaState:
 
     @cached_property
     def _tangent(self) -> Tangent:
-        return self._solver.tangent(self.displacement[None].copy())
+        return self._solver.tangent(self.displacement[None])
 
     @cached_property
     def negative_pivots(self) -> int | None:
@@ -215,7 +225,9 @@ class EquilibriaState:
             else torch.zeros_like(value)
             for name, value in known.items()
         }
-        ways = {name: way.expand_as(known[name]).clone() for name, way in ways.items()}
+        for name, way in ways.items():  # a number may change cell by cell
+            values = torch.broadcast_tensors(known[name], way)
+            known[name], ways[name] = values[0].clone(), values[1].clone()
         forces = torch.func.grad(elastic.energy_of)
         pushed = torch.func.jvp(lambda values: forces(at, values), (known,), (ways,))[1]
         return np.asarray(pushed[0].double().cpu().numpy())

@@ -16,7 +16,8 @@ from .camera import View
 from .figures import Figures, figures_html, legend_html, notice_html
 
 RECORDED_S = 8.0
-ENGINES = ("surrogate", "hybrid", "reference")
+ENGINES = ("surrogate", "hybrid", "reference", "torch")
+_ALONE = ("reference", "torch")  # that need no network
 _SHOWS = {
     "true error": "error",
     "95 % margin": "margin",
@@ -32,8 +33,8 @@ def engines_here(has_network: bool = True) -> tuple[str, ...]:
         has_network: whether the twin has a surrogate.
     """
     has_reference = find_spec("dolfinx") is not None
-    found = [name for name in ENGINES if name == "surrogate" or has_reference]
-    return tuple(name for name in found if has_network or name == "reference")
+    found = [name for name in ENGINES if name in ("surrogate", "torch") or has_reference]
+    return tuple(name for name in found if has_network or name in _ALONE)
 
 
 @dataclass(frozen=True)

@@ -180,12 +180,12 @@ def test_a_recording_is_one_page_with_the_scene_in_it(body: Body) -> None:
     assert pages[0].lstrip().lower().startswith("<!doctype html") and "__VISER_EMBED_DATA__" in pages[0]
 
 
-def test_without_fenicsx_the_surrogate_alone_is_offered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_fenicsx_the_reference_is_not_offered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("softtwin.app.page.controls.find_spec", lambda _: None)
-    assert engines_here() == ("surrogate",)
+    assert engines_here() == ("surrogate", "torch")
     monkeypatch.setattr("softtwin.app.page.controls.find_spec", lambda _: SimpleNamespace())
-    assert engines_here() == ("surrogate", "hybrid", "reference")
-    assert engines_here(has_network=False) == ("reference",)
+    assert engines_here() == ("surrogate", "hybrid", "reference", "torch")
+    assert engines_here(has_network=False) == ("reference", "torch")
 
 
 @pytest.mark.parametrize("place", [Coordinates("mm", "ras"), Coordinates("m", "lps"), Coordinates("cm", "lps")])

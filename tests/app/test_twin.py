@@ -245,6 +245,36 @@ def test_a_body_alone_is_enough_for_the_reference(mesh_folder: Path, seen_body) 
         Twin.open(file, model="reference")
 
 
+@pytest.mark.parametrize("unknown", [[], ["poisson-ratio"], ["contact"]], ids=["forces", "poisson-ratio", "contact"])
+def test_torch_registers_as_the_reference_does(mesh_folder: Path, seen_body, unknown: list[str]) -> None:
+    """The same state, forces, doubt and verdict, by another solver."""
+    pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+    forces, found = pulled(seen_body, (0.0, 0.0, -0.02)), []
+    options = {"zone": "tip", "parameters": unknown, "pose": "fixed"}
+    with Twin.open(mesh_folder, model="torch", **options) as twin:
+        cloud = seen_cloud(twin, forces, noise=2e-4)
+    for model in ("reference", "torch"):
+        with Twin.open(mesh_folder, model=model, **options) as twin:
+            result = twin.register(cloud)
+            told = [(each.name, each.value, each.variance_reduction) for each in result.estimates]
+            doubt = result.uncertainty.margin()
+            found.append((result.displacement, result.net_force, doubt, told, result.judgement.verdict))
+    ours, theirs = found
+    size = np.abs(ours[0]).max()
+    np.testing.assert_allclose(ours[0], theirs[0], atol=1e-3 * size)
+    np.testing.assert_allclose(ours[1], theirs[1], atol=1e-3 * np.abs(ours[1]).max())
+    np.testing.assert_allclose(ours[2], theirs[2], atol=1e-2 * ours[2].max())
+    assert ours[4] is theirs[4] and [each[0] for each in ours[3]] == [each[0] for each in theirs[3]]
+    for one, other in zip(ours[3], theirs[3], strict=True):
+        np.testing.assert_allclose(one[1:], other[1:], rtol=1e-2)
+
+
+def test_torch_says_what_it_does_not_know(mesh_folder: Path) -> None:
+    for options in ({"gravity": (0.0, 0.0, -9.81)}, {"pressure": 100.0}, {"parameters": ["moved@tip"]}):
+        with pytest.raises(ConfigError, match=r"registration\.model: expected reference with these"):
+            Twin.open(mesh_folder, model="torch", zone="tip", **options)
+
+
 def test_the_folder_around_a_twin_opens_it(small_quickstart: Path) -> None:
     for folder in (small_quickstart, small_quickstart / "twin"):
         with Twin.open(folder) as twin:

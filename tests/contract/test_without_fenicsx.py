@@ -112,12 +112,15 @@ def test_a_packaged_twin_predicts_with_derivatives() -> None:
     assert np.log2(found["off"][0] / found["off"][1]) > 1.5  # central differences: of second order
 
 
-def test_a_packaged_twin_registers_a_cloud(phantom: Path, cloud: Path, truth: np.ndarray, tmp_path: Path) -> None:
-    """Its tumour is found to a quarter of what it moved; nothing reads `truth`."""
+@pytest.mark.parametrize("model", ["surrogate", "torch"])
+def test_a_packaged_twin_registers_a_cloud(
+    phantom: Path, cloud: Path, truth: np.ndarray, tmp_path: Path, model: str
+) -> None:
+    """Its tumour is found to a quarter of what it moved, by its network or by equilibria; nothing reads `truth`."""
     body = read_body(phantom / "body.vtu")
     np.save(tmp_path / "truth.npy", body.points + truth)
     words = ["register", phantom, cloud, "--truth", tmp_path / "truth.npy", "--output", tmp_path / "out"]
-    blocked(COMMAND, *words)
+    blocked(COMMAND, *words, "--model", model)
     (frame,) = json.loads((tmp_path / "out" / "registration.json").read_text())["frames"]
     assert frame["verdict"] in ("accepted", "doubtful")
     moved = np.linalg.norm(target_points(body)["tumour"].displace(truth), axis=1).mean()
