@@ -124,6 +124,12 @@ class GenerateArguments(Section):
         metavar="I/N",
         old=("part",),
     )
+    engine: Literal["reference", "torch"] = option(
+        "reference",
+        "what solves the equilibria; torch: many at once, in one process; the reference solves 1 % of them again",
+        basic=True,
+    )
+    device: Literal["cpu", "cuda"] = option("cpu", "device of --engine torch", basic=True)
 
 
 class BuildArguments(Section):

@@ -101,7 +101,9 @@ def mesh(configuration: Path) -> None:
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
 @flags(GenerateArguments)
-def generate(configuration: Path, redo: tuple[int, ...], again: bool, shard: str | None) -> None:
+def generate(
+    configuration: Path, redo: tuple[int, ...], again: bool, shard: str | None, engine: str, device: str
+) -> None:
     """Solve the equilibria of CONFIGURATION's data set; also under `mpirun -n N`. Goes on where it was stopped.
 
     Blocks that are damaged are found and made again. Another body or configuration is refused. Once all parts of an
@@ -112,7 +114,9 @@ def generate(configuration: Path, redo: tuple[int, ...], again: bool, shard: str
     from .stages.generate import describe_data, generate_stage
 
     chosen = None if shard is None else Shard.parse(shard)
-    data = generate_stage(configuration, redo, again, chosen)
+    if device != "cpu" and engine != "torch":
+        raise ConfigError(f"generate --device {device}: expected --engine torch beside it; the reference knows no GPU.")
+    data = generate_stage(configuration, redo, again, chosen, device if engine == "torch" else "")
     if data is not None and chosen is not None:
         missing = len(data.missing_blocks())
         click.echo(f"shard {chosen}: done; {missing} of {data.block_count} blocks of {data.path} are still missing")

@@ -518,11 +518,18 @@ def _solved_row(state: Equilibrium, adjoint: Floats, plan: Plan) -> dict[str, An
         "adjoints": adjoint,
         **{name: getattr(state, name) for name in ("energy", "residual", "iterations", "load_steps")},
         "negative_pivots": pivots,
-        "reason": _judge(state.displacement, pivots, plan),
+        "reason": judged(state.displacement, pivots, plan),
     }
 
 
-def _judge(displacement: Floats, negative_pivots: int, plan: Plan) -> Reason:
+def judged(displacement: Floats, negative_pivots: int, plan: Plan) -> Reason:
+    """Whether a state is learned from, and if not, why.
+
+    Args:
+        displacement: (n, 3), metres.
+        negative_pivots: of its tangent.
+        plan: what is generated.
+    """
     if negative_pivots > 0:
         return Reason.UNSTABLE
     scaled = plan.loads.amplitude is None

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,18 @@ from ..config import Config, ConfigError
 from ..inputs import current_body, generate_inputs, plan_entries
 from ..workspace import Workspace, open_workspace, record_stage
 
+if TYPE_CHECKING:
+    from ..torch_blocks import TorchBlocks
+
 Floats = NDArray[np.float64]
 
 
 def generate_stage(
-    configuration: Path, redo: Sequence[int] = (), again: bool = False, shard: Shard | None = None
+    configuration: Path,
+    redo: Sequence[int] = (),
+    again: bool = False,
+    shard: Shard | None = None,
+    torch_device: str = "",
 ) -> DataSet | None:
     """Solve the equilibria of the data set, those of active rounds after the others, and their Jacobians where wanted.
 
@@ -39,6 +46,7 @@ def generate_stage(
         again: throw away what is there.
         shard: solve the blocks of one shard alone, and of active rounds what they have chosen already; what is missing
             in the end, further rounds and the Jacobians, the whole stage makes.
+        torch_device: `cpu` or `cuda`: torch solves the equilibria there, in one process; empty: the reference.
 
     Raises:
         CalibrationError: active rounds are wanted of a material whose residual torch does not know.
@@ -51,6 +59,8 @@ def generate_stage(
     from softtwin.reference.generate import generate, plan_from_header
 
     comm, begin = MPI.COMM_WORLD, time.perf_counter()
+    if torch_device and comm.size > 1:
+        raise ConfigError(f"generate --engine torch: expected one process, got {comm.size} ranks; leave mpirun out.")
     asked = on_first(comm, lambda: _read(configuration, shard))
     if asked is None:
         generate(None, None, None, comm, shard=shard)
@@ -63,7 +73,9 @@ def generate_stage(
         return None
     space, body, active = asked
     plan = plan_from_header({"plan": plan_entries(space.config)})
-    task = active.solver(space.config) if active else None
+    task, torch_blocks = active.solver(space.config) if active else None, None
+    if torch_device:
+        task = torch_blocks = _torch_blocks(torch_device)
     data = generate(space.data, body, plan, comm, redo, again, shard, task)
     assert data is not None
     while active and shard is None and (number := active.next_round(space.config, data)) is not None:
@@ -71,6 +83,9 @@ def generate_stage(
         on_first(comm, partial(active.choose, space, data, number))
         data = generate(space.data, body, plan, comm, task=task)
         assert data is not None
+    if torch_blocks is not None and torch_blocks.draws:
+        torch_blocks.record(data)
+        data = DataSet(space.data)
     comm.bcast(None, root=0)
     if comm.bcast(shard is None and space.config.wants_jacobians, root=0):
         modes = on_first(comm, lambda: jacobian_modes(space.config, data))
@@ -78,6 +93,16 @@ def generate_stage(
     if shard is None:
         record_stage(space, "generate", time.perf_counter() - begin, generate_inputs(space, body))
     return data
+
+
+def _torch_blocks(device: str) -> TorchBlocks:
+    try:
+        from ..torch_blocks import TorchBlocks
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"generate --engine torch: expected torch, found no {error.name}; install softtwin[torch]."
+        ) from error
+    return TorchBlocks(device)
 
 
 def _active_rounds(config: Config) -> Any:
@@ -121,8 +146,22 @@ def describe_data(data: DataSet) -> str:
     modes = stored_modes(data)
     active = f", {chosen} of them chosen in active rounds" if chosen else ""
     jacobians = "" if modes is None else f", Jacobians of {modes.shape[1]} modes"
-    return (
+    return _solved_elsewhere(data) + (
         f"{total - len(rejected.draws)} equilibria accepted, {len(rejected.draws)} rejected{because}{active}{jacobians}"
+    )
+
+
+def _solved_elsewhere(data: DataSet) -> str:
+    """How well the last run of another engine agrees with the reference, a line; nothing where there was none."""
+    if not data.engines:
+        return ""
+    last = data.engines[-1]
+    checked = last["agreement"]
+    apart = max(checked["differences"], default=0.0)
+    lost = f"; of {len(checked['not_found'])} of them it found none" if checked["not_found"] else ""
+    return (
+        f"{last['accepted']} by {last['engine']} ({last['device']}); {len(checked['draws'])} solved again by the "
+        f"reference: at most {apart:.1e} of the largest displacement apart{lost}\n"
     )
 
 

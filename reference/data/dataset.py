@@ -186,6 +186,12 @@ class DataSet:
         return digest.hexdigest()
 
     @property
+    def engines(self) -> list[dict[str, Any]]:
+        """What solved draws beside the reference, run by run, and how well it agrees with that; none if nothing did."""
+        found: list[dict[str, Any]] = json.loads(str(self._root.attrs.get("engines", "[]")))
+        return found
+
+    @property
     def block_count(self) -> int:
         """Number of blocks when complete."""
         return int(self._root["samples/checksum"].shape[0])

@@ -76,6 +76,7 @@ def _told(source: DataSet) -> dict[str, Any]:
     """What a merged set keeps of a source, with what that was merged from: where its load paths begin, for instance."""
     header = source.header
     known = {name: header[name] for name in ("merged",) if name in header}
+    known |= {"engines": source.engines} if source.engines else {}
     return {"identity": source.identity, "samples": header["samples"], "plan": header.get("plan", {}), **known}
 
 

@@ -113,4 +113,5 @@ def _origin(data: DataSet) -> dict[str, Any]:
     }
     merged = data.header.get("merged")
     more = {} if merged is None else {"merged from": [entry["identity"][:12] for entry in merged]}
-    return {**named, **more, "versions": data.header.get("versions", {})}
+    solved = {"engines": data.engines} if data.engines else {}
+    return {**named, **more, "versions": data.header.get("versions", {}), **solved}

@@ -110,6 +110,17 @@ def write_chosen(path: Path, first: int, ramps: Ints) -> None:
     zarr.open_group(str(path), mode="r+")["active/ramps"][places] = ramps
 
 
+def record_engine(path: Path, entry: Mapping[str, Any]) -> None:
+    """Write down that blocks were solved by something else than the reference, and how well that agrees with it.
+
+    Args:
+        path: folder of the data set.
+        entry: what solved them, of which version, how many draws, and the agreement.
+    """
+    root = zarr.open_group(str(path), mode="r+")
+    root.attrs["engines"] = json.dumps([*DataSet(path).engines, dict(entry)])
+
+
 def drop_block(path: Path, block: int) -> None:
     """Mark a block as missing, so that it is made again.
 
