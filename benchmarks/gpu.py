@@ -34,6 +34,7 @@ from softtwin.reference.data.dataset import DataSet, Samples, Split
 from softtwin.reference.data.samplers import LoadPlan, draw_load
 from softtwin.surrogate.architecture import Architecture
 from softtwin.surrogate.equilibria import Equilibria, NewtonSettings
+from softtwin.surrogate.equilibria_layer import EquilibriaLayer
 from softtwin.surrogate.evaluate import spread
 from softtwin.surrogate.export import Value
 from softtwin.surrogate.fast import FastSurrogate
@@ -191,6 +192,36 @@ def equilibria(data: DataSet, device: str, few: int | None) -> dict[str, Any]:
             "states_per_s": len(truth) / seconds,
         }
     return found
+
+
+def derivatives(data: DataSet, device: str, count: int) -> dict[str, Any]:
+    """Gradients of a misfit through equilibria, by forces and stiffness: how far from the processor's, how fast."""
+    samples = data.samples("test", count)
+    forces, misfit = whole(data, samples.forces), torch.from_numpy(0.9 * samples.displacements)
+
+    def gradients(device: str) -> tuple[list[torch.Tensor], float]:
+        layer = EquilibriaLayer(Equilibria(data.body, data.material, device))
+        given = forces.to(device).requires_grad_()
+        stiffness = torch.tensor(
+            float(data.material.parameters["young_modulus"]), dtype=torch.float64, requires_grad=True
+        )
+        (layer(given, young_modulus=stiffness) - misfit.to(device)).square().sum().backward()  # libraries are loaded
+        given.grad = stiffness.grad = None
+        began = time.perf_counter()
+        (layer(given, young_modulus=stiffness) - misfit.to(device)).square().sum().backward()
+        found = [given.grad.cpu(), stiffness.grad.cpu()]
+        return found, time.perf_counter() - began
+
+    found, seconds = gradients(device)
+    wanted, alone = gradients("cpu") if device != "cpu" else (found, seconds)
+    off = [float((one - other).abs().max() / other.abs().max()) for one, other in zip(found, wanted, strict=True)]
+    return {
+        "loads": len(forces),
+        "off_from_processor": {"forces": off[0], "young_modulus": off[1]},
+        "seconds": seconds,
+        "seconds_on_processor": alone,
+        "states_per_s": len(forces) / seconds,
+    }
 
 
 def summary(values: NDArray[Any]) -> tuple[float, float, float]:
@@ -397,6 +428,7 @@ def main() -> None:
     phases: dict[str, Callable[[], Any]] = {
         "environment": lambda: environment(data, chosen.device),
         "equilibria": lambda: equilibria(data, chosen.device, few if chosen.small else None),
+        "derivatives": lambda: derivatives(data, chosen.device, few if chosen.small else 256),
         "generation": lambda: made(16 if chosen.small else THESIS_SAMPLES)[1],
         **{row.name: partial(trained_and_judged, row) for row in rows(chosen.small)},
         "elastic_forces": lambda: elastic(data, chosen.device, few, max(5, calls // 10)),
