@@ -110,6 +110,32 @@ class FreshArguments(Section):
     fresh: bool = option(False, "throw earlier checkpoints away instead of going on from them", basic=True)
 
 
+class EvaluateArguments(Section):
+    """One run of `softtwin evaluate`."""
+
+    group: ClassVar[str] = "input"
+
+    cloud: tuple[str, ...] = option(
+        (), "file of a cloud, a folder of them, or a pattern in quotes; may be given several times", basic=True
+    )
+    landmarks: tuple[str, str] | None = option(
+        None,
+        "places inside the organ that registration does not see: in the organ at rest, and where they are in each "
+        "cloud's frame (a file, or a folder with one for each cloud, named like it); paired by names, or by rows; with "
+        ":mm, :lps and so on behind a file in another unit or on other axes than the organ's files, or the clouds",
+        basic=True,
+        metavar="REST MOVED",
+    )
+    localisation_error: float = option(
+        0.0,
+        "standard deviation of each coordinate of a landmark that was set by hand; regions are the larger by it",
+        unit="metres",
+        ge=0.0,
+        basic=True,
+    )
+    output: Path = option(Path("evaluation"), "folder to write to", group="output", basic=True)
+
+
 class GenerateArguments(Section):
     """One run of `softtwin generate`."""
 

@@ -23,6 +23,7 @@ from .arguments import (
     CloudArguments,
     DemoArguments,
     DrawArguments,
+    EvaluateArguments,
     ExportArguments,
     FreshArguments,
     GenerateArguments,
@@ -232,6 +233,42 @@ def model_error(configuration: Path) -> None:
     found = model_error_stage(configuration)
     if found is not None:
         click.echo(f"    {found}")
+
+
+@softtwin.command()
+@click.argument("twin", type=_EXISTING)
+@flags(EvaluateArguments, required=("cloud", "landmarks"))
+@flags(CloudArguments)
+@flags(StartArguments, without=("landmarks",))
+@flags(RegistrationSection, without=("forces", "budget"), unset=True)
+def evaluate(
+    twin: Path,
+    cloud: tuple[str, ...],
+    landmarks: tuple[str, str],
+    localisation_error: float,
+    output: Path,
+    unit: Unit | None,
+    frame: Axes | None,
+    start: Path | None,
+    align: str | None,
+    **chosen: Any,
+) -> None:
+    """Hold TWIN against a measured organ: register clouds, and compare landmarks inside with where that puts them.
+
+    Every cloud is registered from rest and alone; the landmarks pull nothing. Written to the folder: evaluation.json
+    and landmarks.csv, with the error of each landmark, how far it is off without the deformation, and its regions of
+    50, 90 and 95 %; `softtwin report` draws them. Landmarks outside the organ at rest are not counted.
+    """
+    from .register import Start
+    from .target_errors import evaluate_files
+
+    if start is not None and align is not None:
+        raise ConfigError("--start, --align: expected one of them, got both.")
+    evaluate_files(
+        twin, cloud, landmarks, output, _given(chosen), unit=unit, axes=frame,
+        start=Start(start, align=align is not None), deviation=localisation_error, say=click.echo,
+    )  # fmt: skip
+    click.echo(f"written to {output}\n{NOTICE}")
 
 
 @softtwin.command()

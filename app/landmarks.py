@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.export import Coordinates
-from softtwin.meshes.io import RAS_TO_LPS, FileError
+from softtwin.meshes.io import RAS_TO_LPS, ContentError, FileError, read_points
+from softtwin.meshes.io.clouds import TABLES
 from softtwin.meshes.io.landmarks import SUFFIXES, read_named_points
 from softtwin.registration.pose import LandmarkFit, from_landmarks
 from softtwin.registration.residuals.landmarks import LandmarkPairs
@@ -117,6 +118,18 @@ class LandmarkFiles:
         Raises:
             FileError: the file cannot be read, or shares no name with the body's.
         """
+        found = self.named(cloud)
+        return None if found is None else found[1:]
+
+    def named(self, cloud: Path) -> tuple[list[str], Floats, Floats] | None:
+        """The same with their names.
+
+        Args:
+            cloud: file of the cloud.
+
+        Raises:
+            FileError: as for `of`.
+        """
         file = self.camera
         if file.is_dir():
             named = [file / f"{cloud.stem}{suffix}" for suffix in SUFFIXES]
@@ -130,10 +143,26 @@ class LandmarkFiles:
             raise FileError(
                 f"{file}: expected landmarks that the body has ({', '.join(self.body)}), got {', '.join(found)}."
             )
-        return np.array([self.body[name] for name in common]), np.array([found[name] for name in common])
+        return common, np.array([self.body[name] for name in common]), np.array([found[name] for name in common])
 
 
 def _read(path: Path, coordinates: Coordinates) -> dict[str, Floats]:
+    """Points by name, on the inner axes; those of a table of numbers alone are named by their rows, from 1."""
+    try:
+        return _named(path, coordinates)
+    except FileError as error:
+        if path.suffix.lower() not in (*TABLES, ".npy"):
+            raise
+        try:
+            rows = read_points(path, coordinates.unit, coordinates.axes)
+        except (FileError, ContentError):
+            raise error from None
+        if rows.rows != len(rows.points):  # a row without a measurement has no number any more
+            raise error from None
+        return {str(number): place for number, place in enumerate(rows.points, 1)}
+
+
+def _named(path: Path, coordinates: Coordinates) -> dict[str, Floats]:
     found = read_named_points(path, coordinates.unit)
     if found.axes is None:
         return {name: coordinates.directions(place) for name, place in found.points.items()}

@@ -46,6 +46,7 @@ from .pictures import (
 )
 from .record import NOTICE
 from .sequences import find_registrations, sequence_section
+from .target_errors import evaluation_section, find_evaluations
 from .workspace import Workspace, read_records
 
 Floats = NDArray[np.float64]
@@ -83,6 +84,7 @@ def report_stage(space: Workspace, registrations: Sequence[Path] = ()) -> Path:
     sections = {name: _guarded(make, space, studio) for name, make in _SECTIONS.items()}
     folders = find_registrations(space.folder, registrations)
     sections["sequences"] = _guarded(lambda space, studio: _sequences(space, studio, folders), space, studio)
+    sections["evaluations"] = _guarded(_evaluations, space, studio)
     path = space.folder / "report.html"
     path.write_text(_fill_template(space, studio, sections), encoding="utf-8")
     return path
@@ -98,6 +100,21 @@ def _sequences(space: Workspace, studio: Studio, folders: Sequence[Path]) -> Sec
 
     def section(folder: Path) -> Section:
         made = _guarded(lambda space, studio: sequence_section(folder, body, studio), space, studio)
+        return {"name": folder.resolve().name, **made}
+
+    return {"every": [section(folder) for folder in folders]}
+
+
+def _evaluations(space: Workspace, studio: Studio) -> Section:
+    folders = find_evaluations(space.folder)
+    if not folders:
+        raise _Missing(
+            "Nothing has been held against a measured organ: softtwin evaluate TWIN --cloud CLOUD --landmarks REST "
+            f"MOVED --output {space.folder.name}/evaluation compares landmarks with where registration puts them."
+        )
+
+    def section(folder: Path) -> Section:
+        made = _guarded(lambda space, studio: evaluation_section(folder), space, studio)
         return {"name": folder.resolve().name, **made}
 
     return {"every": [section(folder) for folder in folders]}

@@ -24,7 +24,7 @@ Section = dict[str, Any]
 _LISTED = 40  # rows of the table: the first, the last, and those that were not accepted
 _CHECKED = 5  # frames whose checks are shown: the first, and those that were not accepted
 _WORST = ("accepted", "doubtful", "refused")
-_COLOURS = {"accepted": "#2f9e44", "doubtful": "#e8a33d", "refused": "#d9480f"}
+COLOURS = {"accepted": "#2f9e44", "doubtful": "#e8a33d", "refused": "#d9480f"}
 
 
 def find_registrations(folder: Path, further: Iterable[Path] = ()) -> list[Path]:
@@ -69,7 +69,7 @@ def sequence_section(folder: Path, body: Body, studio: Studio) -> Section:
         "known": options.get("forces") == "known",
         "frames": len(rows),
         "counts": record["counts"],
-        "colours": _COLOURS,
+        "colours": COLOURS,
         "rows": shown,
         "unlisted": len(rows) - len(shown),
         "checked": [
@@ -206,10 +206,10 @@ def _draw(sheet: Figure, rows: Sequence[Mapping[str, Any]]) -> None:
     deviations = [float(np.linalg.norm(row["net_force_deviation_N"])) for row in found]
     left.errorbar(frames, force, deviations, fmt="none", ecolor="#8a929c", elinewidth=1)
     for axes, values in ((left, force), (right, [1e3 * (row["noise_m"] or np.nan) for row in found])):
-        axes.scatter(frames, values, s=20, c=[_COLOURS[row["verdict"]] for row in found], zorder=3)
+        axes.scatter(frames, values, s=20, c=[COLOURS[row["verdict"]] for row in found], zorder=3)
         for row in rows:
             if "net_force_N" not in row:
-                axes.axvline(row["frame"], color=_COLOURS["refused"], linewidth=1, linestyle=":")
+                axes.axvline(row["frame"], color=COLOURS["refused"], linewidth=1, linestyle=":")
         axes.set_ylim(bottom=0.0)
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.grid(alpha=0.25)

@@ -90,17 +90,29 @@ class Uncertainty:
         Raises:
             ValueError: another confidence.
         """
-        if not 0.0 < confidence < 1.0:
-            raise ValueError(f"Uncertainty.margin.confidence: expected a number in (0, 1), got {confidence}.")
-        every = self._of_nodes if points is None else self.covariances(points)
-        mean = np.trace(every, axis1=1, axis2=2)
-        if not np.isfinite(mean).all():
-            return np.full(len(mean), np.inf)
-        squares = np.einsum("pij,pij->p", every, every)
-        known = squares > 0.0
-        freedom = np.divide(mean**2, squares, out=np.ones_like(mean), where=known)
-        factor = np.divide(squares, mean, out=np.zeros_like(mean), where=known)
-        return np.sqrt(factor * np.exp(_log_quantile(confidence)(freedom)))
+        return margins_of(self._of_nodes if points is None else self.covariances(points), confidence)
+
+
+def margins_of(covariances: Floats, confidence: float = 0.95) -> Floats:
+    """Distance within which a normal error of each covariance is, with so much confidence, (p,), metres.
+
+    Args:
+        covariances: (p, 3, 3), square metres.
+        confidence: in (0, 1).
+
+    Raises:
+        ValueError: another confidence.
+    """
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"Uncertainty.margin.confidence: expected a number in (0, 1), got {confidence}.")
+    mean = np.trace(covariances, axis1=1, axis2=2)
+    if not np.isfinite(mean).all():
+        return np.full(len(mean), np.inf)
+    squares = np.einsum("pij,pij->p", covariances, covariances)
+    known = squares > 0.0
+    freedom = np.divide(mean**2, squares, out=np.ones_like(mean), where=known)
+    factor = np.divide(squares, mean, out=np.zeros_like(mean), where=known)
+    return np.sqrt(factor * np.exp(_log_quantile(confidence)(freedom)))
 
 
 @lru_cache
