@@ -216,6 +216,11 @@ class Registration:
             return None
         return scales.shared, scales.length
 
+    @property
+    def shares_most_noise(self) -> bool:
+        """Whether neighbouring points share more noise than each has alone."""
+        return self.shared_noise is not None and self.shared_noise[0] > self.noise
+
     @cached_property
     def scatter(self) -> float:
         """Standard deviation of a point's distance with what neighbours share of its noise, metres."""

@@ -32,17 +32,18 @@ class Localised(Ended):
     is_settled: bool = True
 
 
-def localise(setup: Setup, points: Cloud) -> Localised:
+def localise(setup: Setup, points: Cloud, leading: int | None = None) -> Localised:
     """The place of the forces, from rest; where time is over before the end, as far as it was found.
 
     Args:
         setup: what is registered.
         points: of the cloud.
+        leading: directions of force to begin with; `ACCURACY.leading` if not given.
     """
     prepared, rule, solver = setup.unlocalised, setup.options.localisation, setup.options.solver
     few, is_gathered = points.thinned(rule.points), rule.rounds > 0
     begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
-    found = from_rest(setup, *begun)
+    found = from_rest(setup, *begun, leading)
     for left in reversed(range(rule.rounds)):
         if setup.is_hopeless(found) or setup.is_late:
             break
@@ -51,7 +52,7 @@ def localise(setup: Setup, points: Cloud) -> Localised:
         try:
             again = _carried_on(setup.plain(seen, prepared), solver, found, nodal)
         except NotConverged:  # gathered, such forces may have no state
-            again = from_rest(setup, seen, prepared, solver)
+            again = from_rest(setup, seen, prepared, solver, leading)
         found = after(found, again)
     return Localised(prepared, found, is_gathered)
 
@@ -63,7 +64,9 @@ def _carried_on(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResu
     return solver.solve(problem, start, found.evaluation, found.local.eta)
 
 
-def from_rest(setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS) -> SolverResult:
+def from_rest(
+    setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS, leading: int | None = None
+) -> SolverResult:
     """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all.
 
     Args:
@@ -71,8 +74,9 @@ def from_rest(setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewt
         points: of the cloud.
         prepared: forces.
         solver: that ends it.
+        leading: as for `localise`.
     """
-    few, first = points.thinned(setup.options.localisation.points), prepared.leading(ACCURACY.leading)
+    few, first = points.thinned(setup.options.localisation.points), prepared.leading(leading or ACCURACY.leading)
     coarse, problem = setup.plain(few, first).unshared, setup.plain(points, prepared)
     begun = solver.coarse().solve(coarse, np.zeros(coarse.size))
     start = problem.carried(begun.evaluation.coefficients, coarse)

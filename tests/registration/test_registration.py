@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from softtwin.registration.options import RegistrationOptions
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.parameters.nodal_forces import NodalForces, nodal_forces
 from softtwin.registration.parameters.pose import PosePrior
+from softtwin.registration.policy import ACCURACY
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registrar, register_sequence
 from softtwin.registration.result import Registration
@@ -229,3 +231,18 @@ def test_options_that_cannot_be_are_named(name: str) -> None:
         RegistrationOptions(maximum_points=0)
     with pytest.raises(ValueError, match="LBFGS"):
         LBFGS(memory=0)
+
+
+@pytest.mark.parametrize(("scatters", "taken"), [((8e-4,), 0), ((8e-4, 2e-4), 1), ((8e-4, 7e-4), 0)])
+def test_a_cold_start_that_leaves_patches_is_tried_once_more(
+    body: Body, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, scatters: tuple[float, ...], taken: int
+) -> None:
+    """From half of the directions; the second is taken where it is better by more than half. No third is tried."""
+    made, begun = registrar(body), []
+    points = made.setup.checked(cloud_on(body, np.zeros_like(body.points), 100, rng, 5e-4))
+    found = [SimpleNamespace(shares_most_noise=len(scatters) > 1, scatter=each) for each in scatters]
+    monkeypatch.setattr("softtwin.registration.registrar.localise", lambda *words: begun.append(words[2:]))
+    monkeypatch.setattr("softtwin.registration.registrar.finish", lambda *_: None)
+    monkeypatch.setattr(made, "_concluded", lambda *_: found[len(begun) - 1])
+    assert made._cold(points, 0.0) is found[taken]
+    assert begun == [(), (ACCURACY.leading // 2,)][: len(scatters)]
