@@ -288,7 +288,7 @@ class Registrar:
         if known is not None and self.setup.is_late and known.judgement.verdict is Verdict.ACCEPTED:
             return known
         cold = self._concluded(finish(self.setup, points, begun), begin)
-        if cold.shares_most_noise and not self.setup.is_late:
+        if cold.shared_noise_dominates and not self.setup.is_late:
             with suppress(NotConverged):
                 again = localise(self.setup, points, max(1, ACCURACY.leading // 2))
                 other = self._concluded(finish(self.setup, points, again), begin)

@@ -217,7 +217,7 @@ class Registration:
         return scales.shared, scales.length
 
     @property
-    def shares_most_noise(self) -> bool:
+    def shared_noise_dominates(self) -> bool:
         """Whether neighbouring points share more noise than each has alone."""
         return self.shared_noise is not None and self.shared_noise[0] > self.noise
 

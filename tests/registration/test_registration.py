@@ -240,7 +240,7 @@ def test_a_cold_start_that_leaves_patches_is_tried_once_more(
     """From half of the directions; the second is taken where it is better by more than half. No third is tried."""
     made, begun = registrar(body), []
     points = made.setup.checked(cloud_on(body, np.zeros_like(body.points), 100, rng, 5e-4))
-    found = [SimpleNamespace(shares_most_noise=len(scatters) > 1, scatter=each) for each in scatters]
+    found = [SimpleNamespace(shared_noise_dominates=len(scatters) > 1, scatter=each) for each in scatters]
     monkeypatch.setattr("softtwin.registration.registrar.localise", lambda *words: begun.append(words[2:]))
     monkeypatch.setattr("softtwin.registration.registrar.finish", lambda *_: None)
     monkeypatch.setattr(made, "_concluded", lambda *_: found[len(begun) - 1])
