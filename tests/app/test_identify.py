@@ -212,11 +212,11 @@ def test_bad_unknowns(folder: Path, tmp_path: Path, words: list[str], message: s
 
 
 def test_a_network_takes_no_other_stiffness() -> None:
-    with pytest.raises(ConfigError, match=r"registration\.model: expected reference or hybrid or torch with these parameters"):
+    with pytest.raises(ConfigError, match=r"registration\.model: expected reference or hybrid or torch with"):
         parse_config({"registration": {"parameters": ["young-modulus"]}})
     with pytest.raises(ConfigError, match=r"registration\.model: expected reference with these parameters"):
         parse_config({"registration": {"model": "hybrid", "gravity": [0.0, 0.0, -9.81]}})
-    with pytest.raises(ConfigError, match=r"registration\.model: expected reference or hybrid or torch with these parameters"):
+    with pytest.raises(ConfigError, match=r"registration\.model: expected reference or hybrid or torch with"):
         parse_config({"registration": {"known_forces": "forces.npy"}})
     with pytest.raises(ConfigError, match=r"registration\.model: expected reference with these parameters"):
         known = {"parameters": ["young-modulus"], "forces": "known"}  # nothing is left for a network to find
