@@ -205,7 +205,6 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     found["force"] = {str(share): float(np.mean(squares <= chi2.ppf(share, 3))) for share in SHARES}
     found["z_rms"] = float(np.sqrt(np.mean(squares / 3.0)))
     found["force_off"] = float(np.median([row["force_off"] for row in used]))
-    found["alike"] = float(np.median([row["alike"] for row in used]))
     found["median_seconds"] = float(np.median([row["seconds"] for row in used]))
     return found
 
