@@ -139,11 +139,21 @@ class LandmarkFiles:
             file = present[0]
         found = _read(file, self.coordinates)
         common = [name for name in self.body if name in found]
+        if len(self.body) != len(found) and _is_of_rows(self.body) and _is_of_rows(found):
+            raise FileError(
+                f"{file}: expected as many rows as there are places in the organ at rest, {len(self.body)}, got "
+                f"{len(found)}: without names rows are paired in their order."
+            )
         if not common:
             raise FileError(
                 f"{file}: expected landmarks that the body has ({', '.join(self.body)}), got {', '.join(found)}."
             )
         return common, np.array([self.body[name] for name in common]), np.array([found[name] for name in common])
+
+
+def _is_of_rows(points: Mapping[str, Floats]) -> bool:
+    """Whether names are the numbers of rows."""
+    return list(points) == [str(number) for number in range(1, len(points) + 1)]
 
 
 def _read(path: Path, coordinates: Coordinates) -> dict[str, Floats]:
@@ -157,8 +167,11 @@ def _read(path: Path, coordinates: Coordinates) -> dict[str, Floats]:
             rows = read_points(path, coordinates.unit, coordinates.axes)
         except (FileError, ContentError):
             raise error from None
-        if rows.rows != len(rows.points):  # a row without a measurement has no number any more
-            raise error from None
+        if rows.rows != len(rows.points):
+            raise FileError(
+                f"{path}: expected three numbers in each row, got {rows.rows - len(rows.points)} of {rows.rows} rows "
+                "without a place (NaN, infinite, or zero more than once): rows are paired by their numbers."
+            ) from None
         return {str(number): place for number, place in enumerate(rows.points, 1)}
 
 

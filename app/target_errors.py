@@ -69,6 +69,13 @@ class CaseErrors:
         """Which landmarks count: inside the organ, of a registration that gave a result, (l,)."""
         return ~self.is_outside & np.isfinite(self.errors)
 
+    def margins(self, confidence: float) -> Floats:
+        """Radius of each landmark's region, (l,), metres; infinite where nothing is known of it."""
+        found = np.full(len(self.errors), np.inf)
+        known = np.isfinite(self.covariances).all(axis=(1, 2))
+        found[known] = margins_of(self.covariances[known], confidence)
+        return found
+
 
 def evaluate_files(
     place: Path,
@@ -113,26 +120,31 @@ def evaluate_files(
     without = [file.path.name for file, found in pairs if found is None]
     if without:
         say(f"without landmarks, left out: {', '.join(without)}")
+    head = {
+        "notice": NOTICE,
+        "twin": place.resolve().name,
+        "model": options.get("model", scene.home.config.registration.model),
+        "localisation_error_m": deviation,
+        "without_landmarks": without,
+    }
     cases: list[CaseErrors] = []
+    evaluation = head
     with scene.opened(start or Start(), say) as (twin, camera):
         say_coordinates(twin, say)
         for file, found in tqdm(pairs, desc="registering", unit="cloud", disable=None):
             if found is not None:
                 cases.append(case_errors(twin, file, camera, found, deviation))
                 say(describe_case(cases[-1]))
-    evaluation = {
-        "notice": NOTICE,
-        "twin": place.resolve().name,
-        "model": options.get("model", scene.home.config.registration.model),
-        "localisation_error_m": deviation,
-        "without_landmarks": without,
-        **summary(cases),
-    }
+                evaluation = {**head, **summary(cases)}
+                _write(output, evaluation, cases)  # cloud by cloud: who stops keeps what was found
+    say(describe(evaluation))
+    return evaluation
+
+
+def _write(output: Path, evaluation: Mapping[str, Any], cases: Sequence[CaseErrors]) -> None:
     output.mkdir(parents=True, exist_ok=True)
     (output / RECORD).write_text(json.dumps(evaluation, indent=1, allow_nan=False) + "\n")
     _write_table(output / TABLE, cases)
-    say(describe(evaluation))
-    return evaluation
 
 
 def _named(text: str, usual: Coordinates) -> tuple[Path, Coordinates]:
@@ -234,6 +246,10 @@ def _together(cases: Sequence[CaseErrors]) -> dict[str, Any]:
     if not every:
         return counted
     errors, moved = (np.concatenate([getattr(case, of)[case.is_known] for case in cases]) for of in ("errors", "moved"))
+    regions = {
+        level: np.concatenate([case.margins(level)[case.is_known] for case in cases])
+        for level in (*CONFIDENCES, *CURVE)
+    }
     covariances = np.concatenate([case.covariances[case.is_known] for case in cases])
     worst = int(errors.argmax())
     expected = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
@@ -241,10 +257,10 @@ def _together(cases: Sequence[CaseErrors]) -> dict[str, Any]:
         **counted,
         "error_m": _spread(errors),
         "without_deformation_m": _spread(moved),
-        "expected_error_m": float(np.sqrt(np.mean(expected**2))),
+        "expected_error_m": float(np.sqrt(np.mean(expected**2))) if np.isfinite(expected).all() else None,
         "worst": {"cloud": every[worst][0], "name": every[worst][1], "error_m": float(errors[worst])},
-        "within": {str(level): float(np.mean(errors <= margins_of(covariances, level))) for level in CONFIDENCES},
-        "curve": [[level, float(np.mean(errors <= margins_of(covariances, level)))] for level in CURVE],
+        "within": {str(level): float(np.mean(errors <= regions[level])) for level in CONFIDENCES},
+        "curve": [[level, float(np.mean(errors <= regions[level]))] for level in CURVE],
         "slope_of_error_by_movement": _slope(moved, errors),
     }
 
@@ -266,7 +282,7 @@ def _slope(moved: Floats, errors: Floats) -> float | None:
 
 
 def _landmarks(case: CaseErrors) -> list[dict[str, Any]]:
-    regions = {level: margins_of(case.covariances, level) for level in CONFIDENCES}
+    regions = {level: case.margins(level) for level in CONFIDENCES}
     found = []
     for place, name in enumerate(case.names):
         row: dict[str, Any] = {"name": name, "without_deformation_m": float(case.moved[place])}
@@ -286,7 +302,7 @@ def _write_table(path: Path, cases: Sequence[CaseErrors]) -> None:
         levels = [f"margin{100 * level:.0f}_m" for level in CONFIDENCES]
         writer.writerow(["cloud", "verdict", "landmark", "is_outside", "without_deformation_m", "error_m", *levels])
         for case in cases:
-            margins = np.stack([margins_of(case.covariances, level) for level in CONFIDENCES], axis=1)
+            margins = np.stack([case.margins(level) for level in CONFIDENCES], axis=1)
             for place, name in enumerate(case.names):
                 known = np.isfinite(case.errors[place])
                 row = [case.errors[place], *margins[place]] if known else [""] * (1 + len(levels))

@@ -126,6 +126,24 @@ def test_rows_without_names_are_paired_in_order(capsys, phantom: Path, folder: P
     (case,) = json.loads((folder / "out" / "evaluation.json").read_text())["cases"]
     assert case["landmarks_counted"] == COUNT and case["outside"] == 1
     assert case["landmarks"][-1]["is_outside"] and case["landmarks"][0]["name"] == "1"
+    assert all("margins_m" in row for row in case["landmarks"][:-1])  # one outside takes no other's region away
+    words = [
+        "evaluate",
+        phantom,
+        "--cloud",
+        folder / "clouds" / "frame_0.txt",
+        "--unit",
+        "mm",
+        "--output",
+        folder / "o",
+    ]
+    np.savetxt(folder / "short.txt", 1e3 * CAMERA.apply(moved[:-3]))
+    said = run(capsys, *words, "--landmarks", folder / "rest.txt", folder / "short.txt", code=2)
+    assert f"expected as many rows as there are places in the organ at rest, {COUNT + 1}, got {COUNT - 2}" in said
+    moved[3] = np.nan
+    np.savetxt(folder / "nan.txt", moved)
+    said = run(capsys, *words, "--landmarks", folder / "rest.txt", folder / "nan.txt", code=2)
+    assert "got 1 of 41 rows without a place" in said
 
 
 def test_landmarks_that_were_moved_are_seen_to_be_off(capsys, phantom: Path, folder: Path) -> None:
