@@ -205,7 +205,12 @@ class Equilibria:
         return self._field(len(values)).index_copy(1, self._free, values.reshape(len(values), len(self._free), 3))
 
     def solve(
-        self, forces: ArrayLike | Tensor, start: ArrayLike | Tensor | None = None, *, load_steps: int | None = None
+        self,
+        forces: ArrayLike | Tensor,
+        start: ArrayLike | Tensor | None = None,
+        *,
+        load_steps: int | None = None,
+        iterations: int | None = None,
     ) -> States:
         """States under loads; each in one step where that succeeds, else in 2, 4, ... parts of the load.
 
@@ -213,6 +218,7 @@ class Equilibria:
             forces: nodal forces, (s, n, 3), newtons; none at held nodes.
             start: displacements to begin at, (s, n, 3), metres; none if not given.
             load_steps: parts of a load, at most; as the settings say if not given.
+            iterations: of Newton's method for one part, at most; as the settings say if not given.
 
         Raises:
             ValueError: another shape, numbers that are not finite, or forces on held nodes, where they would be lost.
@@ -225,8 +231,9 @@ class Equilibria:
         if start is not None:
             begin = self._spread(self._picked(self._checked("start", start)))
         size, most = self.settings.chunk or self._chunk(), load_steps or self.settings.load_steps
+        limit = iterations or self.settings.iterations
         parts = [
-            self._solved(loads[i : i + size], None if begin is None else begin[i : i + size], most)
+            self._solved(loads[i : i + size], None if begin is None else begin[i : i + size], most, limit)
             for i in range(0, max(len(loads), 1), size)
         ]
         if len(parts) == 1:
@@ -253,9 +260,9 @@ class Equilibria:
         free = torch.cuda.mem_get_info(self.device)[0] // 4 if self.device.type == "cuda" else 2**28
         return max(1, int(free // state))
 
-    def _solved(self, loads: Tensor, begin: Tensor | None, most: int) -> States:
+    def _solved(self, loads: Tensor, begin: Tensor | None, most: int, limit: int) -> States:
         start = self._starts(loads) if begin is None else begin
-        found = self._newton(loads, start)
+        found = self._newton(loads, start, limit)
         origin = torch.zeros_like(start) if begin is None else begin
         steps, parts = torch.ones_like(found.iterations), 2
         while parts <= most and not bool(found.is_converged.all()):
@@ -263,7 +270,7 @@ class Equilibria:
             now = origin[missing]
             count = torch.zeros_like(missing)
             for part in range(1, parts + 1):
-                step = self._newton(loads[missing] * (part / parts), now)
+                step = self._newton(loads[missing] * (part / parts), now, limit)
                 now, count = step.displacement, count + step.iterations
             changed = {
                 item.name: getattr(found, item.name).index_copy(0, missing, getattr(step, item.name))
@@ -296,7 +303,7 @@ class Equilibria:
             energy = stored - (loads * moved).sum(dim=1)
         return _Search(displacement, energy, loads - self._picked(internal))
 
-    def _newton(self, loads: Tensor, begin: Tensor) -> States:
+    def _newton(self, loads: Tensor, begin: Tensor, limit: int) -> States:
         now = self._at(loads, begin)
         sizes = torch.linalg.vector_norm(loads, dim=1)
         sizes = torch.where(sizes > 0.0, sizes, 1.0)
@@ -304,10 +311,11 @@ class Equilibria:
         iterations = torch.zeros(len(loads), dtype=torch.int64, device=self.device)
         is_stable = torch.ones_like(relative, dtype=torch.bool)
         is_rounding = torch.zeros_like(is_stable)
+        shifts = torch.zeros_like(iterations)  # that the last tangents needed
         active = torch.nonzero(~(relative <= self.settings.tolerance))[:, 0]
         while len(active):
             here = now[active]
-            factors, is_stable[active] = self._factored(here.displacement)
+            factors, is_stable[active], shifts[active] = self._factored(here.displacement, shifts[active])
             way = factors.solve(here.residual[:, :, None])[:, :, 0]
             after, is_better = self._line_search(loads[active], here, way)
             now.put(active, after)
@@ -317,7 +325,7 @@ class Equilibria:
             relative[active] = left / sizes[active]
             iterations[active] += 1
             goes_on = is_better & ~is_rounding[active] & (relative[active] > self.settings.tolerance)
-            active = active[goes_on & (iterations[active] < self.settings.iterations)]
+            active = active[goes_on & (iterations[active] < limit)]
         is_converged = (relative <= self.settings.tolerance) | is_rounding
         return States(now.displacement, relative, is_converged, iterations, torch.ones_like(iterations), is_stable)
 
@@ -326,18 +334,26 @@ class Equilibria:
         sizes = torch.linalg.vector_norm(displacement, dim=(1, 2))
         return _EPSILONS * self._epsilon * (self._force_scale + self._stiffness_scale * sizes)
 
-    def _factored(self, displacement: Tensor) -> tuple[Factors, Tensor]:
-        """Factors of the tangents, shifted until they are positive definite, and which of them were, (s,)."""
+    def _factored(self, displacement: Tensor, before: Tensor) -> tuple[Factors, Tensor, Tensor]:
+        """Factors of the tangents, shifted until they are positive definite; which of them were, (s,); their shifts.
+
+        Args:
+            displacement: (s, n, 3), metres.
+            before: shifts that the tangents of the iteration before needed, (s,): 0 none, else the number of it. One
+                less is tried first, since tangents are alike from one iteration to the next.
+        """
         entries = self._matrices.assembled(self.elastic.cell_stiffnesses(displacement))
         factors = self._matrices.factor(entries)
         is_stable = factors.is_positive.clone()
-        for shift in _SHIFTS:
-            wrong = torch.nonzero(~factors.is_positive)[:, 0]
-            if not len(wrong):
-                break
-            shifted = self._matrices.factor(entries[wrong] + shift * self._rest)
-            factors.put(wrong, shifted)
-        return factors, is_stable
+        shifts = torch.where(is_stable, 0, torch.clamp(before - 1, 1, len(_SHIFTS)))
+        sizes = torch.tensor((0.0, *_SHIFTS), dtype=self.dtype, device=self.device)
+        wrong = torch.nonzero(~is_stable)[:, 0]
+        while len(wrong):
+            factors.put(wrong, self._matrices.factor(entries[wrong] + sizes[shifts[wrong], None] * self._rest))
+            is_left = ~factors.is_positive[wrong] & (shifts[wrong] < len(_SHIFTS))
+            wrong = wrong[is_left]
+            shifts[wrong] += 1
+        return factors, is_stable, shifts
 
     def _line_search(self, loads: Tensor, here: _Search, way: Tensor) -> tuple[_Search, Tensor]:
         """Steps by Armijo's rule on the energy with quadratic interpolation, and whether there is one, (s,).

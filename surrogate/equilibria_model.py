@@ -19,6 +19,7 @@ from softtwin.reference.data.outcome import NotConverged
 from .equilibria import Equilibria, Tangent
 
 Floats = NDArray[np.float64]
+_NEARBY = 8  # Newton iterations from a state nearby: in registrations none that led to a state took more
 _COUNTED = 3000  # unknowns, up to which the directions of an indefinite tangent are counted
 
 
@@ -90,7 +91,8 @@ class EquilibriaModel:
         load[self.body.fixed] = 0.0
         found = None
         if near is not None:
-            found = solver.solve(load[None], self._start(solver, load, near)[None], load_steps=1)
+            start = self._start(solver, load, near)
+            found = solver.solve(load[None], start[None], load_steps=1, iterations=_NEARBY)
         if found is None or (self.patient and not bool(found.is_converged[0])):
             found = solver.solve(load[None])
         if not bool(found.is_converged[0]):

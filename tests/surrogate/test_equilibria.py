@@ -195,7 +195,7 @@ def test_an_indefinite_tangent_is_got_over(law: Material, bar: Body, solver: Equ
     """Pushed together so far that it is no minimum, the beam finds the state of no load again."""
     squeezed = torch.zeros(1, len(bar.points), 3, dtype=torch.float64)
     squeezed[0, :, 0] = torch.from_numpy(-0.45 * bar.points[:, 0])
-    _, is_stable = solver._factored(squeezed)
+    _, is_stable, _ = solver._factored(squeezed, torch.zeros(len(squeezed), dtype=torch.int64))
     assert not is_stable.any()
     found = solver.solve(torch.zeros_like(squeezed), squeezed)
     assert found.is_converged.all() and found.displacement.abs().max() < 1e-6
