@@ -342,9 +342,10 @@ class RegistrationSection(Section):
         "in the organ's coordinates, as well as known_rotation and known_translation say",
         group="pose",
     )
-    forces: Literal["unknown", "known"] = option(
+    forces: Literal["unknown", "normal", "known"] = option(
         "unknown",
-        "known: none beside known_forces, gravity and pressure; the parameters are to be found",
+        "normal: an unknown pressure alone, along the normal of the undeformed surface, which slides (a lung in its "
+        "chest); known: none beside known_forces, gravity and pressure; the parameters are to be found",
         group="forces",
     )
     parameters: tuple[str, ...] = option(
@@ -442,6 +443,8 @@ class RegistrationSection(Section):
                 f"registration.model: expected {' or '.join(models)} with these parameters and known loads (a network "
                 f"has learned one material, one support and forces alone), got {self.model}"
             )
+        if "weight" in kinds and not any(self.gravity):
+            raise ValueError("registration.parameters: expected gravity beside weight, got none (gravity = [0, 0, 0])")
         if self.forces == "known" and not others:
             raise ValueError(
                 "registration.parameters: expected at least one (young-modulus, poisson-ratio, moved@NODES) where all "

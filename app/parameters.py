@@ -33,12 +33,14 @@ class Kind:
         input: of the forward model, by the body, the place and the number; None for another kind of block.
         block: any other block, by the observed side, the place and the number; None for an input.
         placed: whether a place belongs to it.
+        needs_gravity: an input, too: that of the known gravity.
     """
 
     words: str
     input: Callable[[Body, str, float | None], InputBlock] | None = None
     block: Callable[[SurfaceDistance, str, float | None], ParameterBlock] | None = None
     placed: Literal["never", "maybe", "always"] = "never"
+    needs_gravity: bool = False
 
 
 def _young_modulus(body: Body, place: str, deviation: float | None) -> YoungModulus:
@@ -63,6 +65,7 @@ KINDS = {
     ),
     "poisson-ratio": Kind("poisson-ratio", _poisson_ratio),
     "moved": Kind("moved@NODES (a zone or node set that moves as a rigid whole)", _moved, placed="always"),
+    "weight": Kind("weight (of gravity: how many times what density and gravity say)", needs_gravity=True),
     "contact": Kind("contact (one patch of unknown place instead of forces anywhere)"),
 }
 
@@ -113,7 +116,7 @@ class NamedParameter:
     @property
     def is_input(self) -> bool:
         """Whether it is an input of the forward model, which a network has learned one value of."""
-        return KINDS[self.kind].input is not None
+        return KINDS[self.kind].input is not None or KINDS[self.kind].needs_gravity
 
     def input_block(self, body: Body) -> InputBlock | None:
         """What it is to the model; None where it is no input.

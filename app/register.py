@@ -317,7 +317,7 @@ class Scene:
             ConfigError, FileError, PoseError, TwinError: what cannot be used, and why.
         """
         section = twins.with_options(self.home.config, dict(self.options)).registration
-        for line in priors_taken(section.parameters) if section.forces == "unknown" else ():
+        for line in priors_taken(section.parameters) if section.forces != "known" else ():
             say(line)
         pose = None
         if start.matrix is not None:

@@ -9,11 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.embedding import outer
 from softtwin.meshes.export import Coordinates
+from softtwin.meshes.metrics import nodal_volumes
 from softtwin.reference.data.loading import Loading
 from softtwin.registration.contact import Patch
 from softtwin.registration.parameters.block import ParameterBlock
+from softtwin.registration.parameters.input_block import InputBlock
 from softtwin.registration.parameters.inputs import InputBlocks
+from softtwin.registration.parameters.weight import Weight
 from softtwin.registration.surface_distance import SurfaceDistance
 
 from .config import Config
@@ -32,6 +36,8 @@ class Scenario:
         gravity: on the axes of the twin's files, (3,), m/s^2.
         pressure: on the whole boundary, pascals.
         density: kg/m^3.
+        floats: what surrounds the organ carries its weight by a pressure that grows with depth; the pressure that is
+            unknown is beside it.
     """
 
     parameters: tuple[NamedParameter, ...]
@@ -39,6 +45,7 @@ class Scenario:
     gravity: tuple[float, float, float]
     pressure: float
     density: float
+    floats: bool = False
 
     @classmethod
     def of(cls, config: Config) -> Scenario:
@@ -50,6 +57,7 @@ class Scenario:
             section.gravity,
             section.pressure,
             config.material.density,
+            section.forces == "normal",
         )
 
     @property
@@ -81,9 +89,23 @@ class Scenario:
         Raises:
             ParameterError: no such file, or forces of another body.
         """
-        weight = coordinates.directions(np.array(self.gravity)) * self.density if any(self.gravity) else None
+        weight = None if self.unknown_weight is not None else self._weight(coordinates)
         pressure = {"boundary": self.pressure} if self.pressure else {}
-        return Loading(self._known_forces(body, coordinates), weight, pressure=pressure)
+        forces = self._known_forces(body, coordinates)
+        if self.floats and weight is not None:
+            carrying = buoyancy(body, weight)
+            carrying[body.fixed] = 0.0  # what holds the organ carries the rest
+            forces = carrying if forces is None else forces + carrying
+        return Loading(forces, weight, pressure=pressure)
+
+    @property
+    def unknown_weight(self) -> NamedParameter | None:
+        """The weight as it is named where it is known but for a factor."""
+        return next((named for named in self.parameters if named.kind == "weight"), None)
+
+    def _weight(self, coordinates: Coordinates) -> Floats | None:
+        """Force per volume, (3,), N/m^3; None without gravity."""
+        return coordinates.directions(np.array(self.gravity)) * self.density if any(self.gravity) else None
 
     def _known_forces(self, body: Body, coordinates: Coordinates) -> Floats | None:
         if self.forces is None:
@@ -106,18 +128,24 @@ class Scenario:
         found[body.fixed] = 0.0
         return found
 
-    def inputs(self, body: Body, modulus: float, ratio: float) -> InputBlocks | None:
+    def inputs(self, body: Body, modulus: float, ratio: float, coordinates: Coordinates) -> InputBlocks | None:
         """The unknown inputs of the model; None where there are none.
 
         Args:
             body: the body.
             modulus: expected Young's modulus, pascals.
             ratio: expected Poisson's ratio.
+            coordinates: of the twin's files.
 
         Raises:
             ValueError: no such structure or node set, or each named twice.
         """
-        made = [parameter.input_block(body) for parameter in self.parameters]
+        made: list[InputBlock | None] = [parameter.input_block(body) for parameter in self.parameters]
+        named, weight = self.unknown_weight, self._weight(coordinates)
+        if named is not None and weight is not None:
+            forces = nodal_volumes(body)[:, None] * weight + (buoyancy(body, weight) if self.floats else 0.0)
+            forces[body.fixed] = 0.0
+            made.append(Weight(forces) if named.number is None else Weight(forces, named.number))
         blocks = tuple(block for block in made if block is not None)
         values = {"young_modulus": self.modulus(modulus, body), "poisson_ratio": ratio}
         return InputBlocks(body, values, blocks) if blocks else None
@@ -130,3 +158,24 @@ class Scenario:
         """
         made = [parameter.block(observed) for parameter in self.parameters]
         return tuple(block for block in made if block is not None)
+
+
+def buoyancy(body: Body, weight: Floats) -> Floats:
+    """Nodal forces of the pressure of surroundings in which a body floats, (n, 3), newtons.
+
+    The pressure grows along the weight as in a liquid of the body's own density, so that it carries all of the weight
+    and turns nothing (Archimedes); it is none at the middle of the nodes.
+
+    Args:
+        body: the body.
+        weight: force per volume, (3,), N/m^3.
+    """
+    surface = outer(body)
+    triangles = surface.rest.triangles
+    corners = surface.rest.points[triangles]
+    areas = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    depths = (corners - body.points.mean(axis=0)) @ weight
+    shares = (depths + depths.sum(axis=1, keepdims=True)) / 12.0  # of a pressure that is linear in each triangle
+    of_vertices = np.zeros_like(surface.rest.points)
+    np.add.at(of_vertices, triangles.ravel(), -(shares[:, :, None] * areas[:, None, :]).reshape(-1, 3))
+    return surface.spread(of_vertices)

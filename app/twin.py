@@ -467,10 +467,11 @@ class Twin:
 
     def _prepared(self, zone: str, camera: PosePrior | None) -> Engine:
         section = self.config.registration
+        is_known_where = bool(zone) or section.forces == "normal"
 
         def posed(plain: Registrar) -> Registrar:
             assert camera is not None
-            options = _options(section, options_for(plain.model, bool(zone)))
+            options = _options(section, options_for(plain.model, is_known_where))
             return plain.with_pose(camera, options)
 
         if camera is not None:
@@ -492,7 +493,9 @@ class Twin:
             return None
         material = self.config.material
         try:
-            return Scenario.of(self.config).inputs(self.body, material.young_modulus, material.poisson_ratio)
+            return Scenario.of(self.config).inputs(
+                self.body, material.young_modulus, material.poisson_ratio, self.coordinates
+            )
         except ValueError as error:
             raise ConfigError(f"registration.parameters: {error}") from None
 
@@ -515,11 +518,12 @@ class Twin:
             force_scale=section.force_scale or expected_force(body, self.config.material.young_modulus),
             smoothness=section.smoothness,
             directions=section.directions,
-            options=_options(section, options_for(model, bool(zone))),
+            options=_options(section, options_for(model, bool(zone) or section.forces == "normal")),
             inputs=inputs,
             blocks=Scenario.of(self.config).blocks,
             modulus_deviation=self.config.material.young_modulus_deviation,
             elsewhere=loaded if zone else None,
+            along_normals=section.forces == "normal",
         )
 
 

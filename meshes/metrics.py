@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from .body import HEXAHEDRON_FACES, TETRAHEDRON_FACES, Body, Floats, Ints, corner_jacobians
 from .elements import linear_kind
-from .quadrature import quadrature, shape_functions
+from .quadrature import quadrature, quadrature_degree, shape_functions
 
 # Local edges of a cell (VTK numbering), and the two faces that meet at each edge of a tetrahedron.
 TETRAHEDRON_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
@@ -299,6 +299,20 @@ def cell_volumes(points: Floats, cells: Ints) -> Floats:
         a, b, c = (corners[:, :, i] for i in split)
         total += np.einsum("mfi,mfi->m", a, np.cross(b, c))
     return total / 12
+
+
+def nodal_volumes(body: Body) -> Floats:
+    """Integral of each node's shape function over the body, (n,), cubic metres: they add up to its volume.
+
+    Args:
+        body: the body.
+    """
+    points, weights = quadrature(body.kind, quadrature_degree(body))
+    values, slopes = shape_functions(body.kind, points)
+    jacobians = np.linalg.det(np.einsum("cki,qkj->cqij", body.points[body.cells], slopes))
+    shares = np.einsum("cq,q,qk->ck", jacobians, weights, values)
+    found: Floats = np.bincount(body.cells.ravel(), shares.ravel(), minlength=len(body.points)).astype(np.float64)
+    return found
 
 
 def scaled_jacobians(points: Floats, cells: Ints) -> Floats:

@@ -22,7 +22,7 @@ from .hyperparameters import LogNormalPrior
 from .options import RegistrationOptions
 from .parameters.block import ParameterBlock
 from .parameters.inputs import InputBlocks
-from .parameters.nodal_forces import LikelihoodInformed, NodalForces, known_forces, nodal_forces
+from .parameters.nodal_forces import LikelihoodInformed, NodalForces, known_forces, nodal_forces, normal_forces
 from .parameters.pose import PosePrior
 from .policy import ACCURACY, POLICY
 from .prepared import Prepared
@@ -313,6 +313,7 @@ def prepare(
     blocks: Callable[[SurfaceDistance], Sequence[ParameterBlock]] | None = None,
     modulus_deviation: float = 0.0,
     elsewhere: ArrayLike | None = None,
+    along_normals: bool = False,
 ) -> Registrar:
     """A registrar with forces at the nodes that may carry some, reduced to what a cloud can tell.
 
@@ -329,11 +330,14 @@ def prepare(
         blocks: further parameters, by the observed side.
         modulus_deviation: as for `Registrar`.
         elsewhere: further nodes, where forces are thought of when those given leave what neighbouring points share.
+        along_normals: forces act along the surface's normal alone, see `normal_forces`; nothing is gathered then.
 
     Raises:
         ValueError: no node is left on the free boundary; nothing is unknown; conditions that the model does not take.
     """
     options = options or RegistrationOptions()
+    if along_normals:  # a pressure acts all over the surface
+        options = replace(options, localisation=replace(options.localisation, rounds=0))
     observed = SurfaceDistance(model.body, triangles, options.distance)
     is_anywhere = options.localisation.rounds > 0 and model.error > 0.0
     spread = POLICY.force_spread_anywhere if is_anywhere else POLICY.force_spread
@@ -347,7 +351,7 @@ def prepare(
         carrying = np.asarray(nodes, dtype=np.int64)
         if inputs is not None:
             carrying = np.setdiff1d(carrying, inputs.moved_nodes)
-        every = nodal_forces(model.body, carrying, scale, smoothness)
+        every = (normal_forces if along_normals else nodal_forces)(model.body, carrying, scale, smoothness)
         rule = LikelihoodInformed(options.noise.minimum, maximum=directions)
         forces = Prepared.of(model, observed, every, inputs).informed(observed, rule).forces
 
@@ -363,6 +367,7 @@ def prepare(
             pose=pose,
             inputs=inputs,
             blocks=blocks,
+            along_normals=along_normals,
         )
 
     return Registrar(

@@ -13,7 +13,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.embedding import outer_nodes
+from softtwin.meshes.embedding import outer, outer_nodes
 
 from ..evaluation import Evaluation, Slopes
 from ..forward import ReducedModel
@@ -26,6 +26,7 @@ from .block import ParameterBlock
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _SMALLEST_VARIANCE = 1e-5  # of a pattern of forces, relative to the largest: rougher ones are left out
+_UNIFORM = 100.0  # of its changes, that a pressure may be all over: so much that nothing is believed of it
 _TANGENTIAL = 0.5  # weight of movements along the observed side: they become normal where it turns
 FORCE = LogNormalPrior(0.01, 2.0, minimum=1e-5)
 
@@ -158,16 +159,51 @@ def nodal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, sm
     Raises:
         ValueError: no node is left, or a smoothness that is negative.
     """
+    chosen = _free_boundary("nodal_forces", body, nodes, smoothness)
+    root = _correlation_root(body.points[chosen], smoothness)
+    return NodalForces(chosen, np.kron(root, np.eye(3)), len(body.points), scale)
+
+
+def normal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, smoothness: float = 0.0) -> NodalForces:
+    """Forces along the normal of the surface at rest alone: an unknown pressure, under which neighbours slide.
+
+    So what surrounds an organ acts that is not grown together with it, as ribs and diaphragm on a lung. The pressure is
+    a part that is the same all over, of which nothing is believed, and smooth changes.
+
+    Args:
+        body: the body.
+        nodes: nodes that may carry force; fixed and inner ones are left out.
+        scale: expected size of the changes' force at a node of average area, newtons, and how well it is known.
+        smoothness: correlation length of the changes, metres; 0 for independent nodes.
+
+    Raises:
+        ValueError: as for `nodal_forces`.
+    """
+    chosen = _free_boundary("normal_forces", body, nodes, smoothness)
+    surface = outer(body)
+    corners = surface.rest.points[surface.rest.triangles]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 6.0
+    of_vertices = np.zeros_like(surface.rest.points)
+    np.add.at(of_vertices, surface.rest.triangles.ravel(), np.repeat(areas, 3, axis=0))
+    normals = surface.spread(of_vertices)[chosen]
+    normals /= np.linalg.norm(normals, axis=1).mean()
+    pressures = _correlation_root(body.points[chosen], smoothness)
+    pressures = np.hstack([np.full((len(chosen), 1), _UNIFORM), pressures])
+    patterns = normals[:, :, None] * pressures[:, None, :]
+    return NodalForces(chosen, patterns.reshape(3 * len(chosen), -1), len(body.points), scale)
+
+
+def _free_boundary(name: str, body: Body, nodes: ArrayLike, smoothness: float) -> Ints:
+    """Those of the nodes that may carry force."""
     if not 0.0 <= smoothness < np.inf:
-        raise ValueError(f"nodal_forces.smoothness: expected a length of 0 m or more, got {smoothness}.")
+        raise ValueError(f"{name}.smoothness: expected a length of 0 m or more, got {smoothness}.")
     chosen = np.setdiff1d(np.intersect1d(np.asarray(nodes, dtype=np.int64), outer_nodes(body)), body.fixed)
     if len(chosen) == 0:
         raise ValueError(
-            f"nodal_forces.nodes: expected nodes on the free boundary, none of the {np.size(nodes)} given is; "
+            f"{name}.nodes: expected nodes on the free boundary, none of the {np.size(nodes)} given is; "
             "give the zone that the tool may touch."
         )
-    root = _correlation_root(body.points[chosen], smoothness)
-    return NodalForces(chosen, np.kron(root, np.eye(3)), len(body.points), scale)
+    return chosen
 
 
 def known_forces(body: Body, scale: LogNormalPrior = FORCE) -> NodalForces:

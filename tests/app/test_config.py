@@ -48,6 +48,10 @@ def test_every_entry_says_what_it_means() -> None:
             {"material": {"youngs": 3.0}},
             r"material\.youngs: there is no such entry; did you mean young_modulus\?, got 3\.0",
         ),
+        (
+            {"registration": {"model": "reference", "parameters": ["weight=0.5"]}},
+            r"registration\.parameters: expected gravity beside weight, got none",
+        ),
         ({"body": {"unit": "inch"}}, r"body\.unit: expected one of m, cm, mm, got 'inch'"),
         ({"samples": {"train": 0}}, r"samples\.train: expected a whole number >= 1, got 0"),
         ({"loads": {"radius": [0.5, 0.1]}}, r"\n  loads\.radius: expected smallest <= largest, got \(0\.5, 0\.1\)$"),

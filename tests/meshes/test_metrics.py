@@ -9,6 +9,7 @@ from softtwin.meshes.metrics import (
     mesh_quality,
     net_force_error,
     nodal_errors,
+    nodal_volumes,
     relative_error,
     scaled_jacobians,
     target_errors,
@@ -135,3 +136,16 @@ def test_displacement_gradients_of_a_linear_field_are_exact(any_beam: Body, rng:
         np.testing.assert_allclose(found, np.broadcast_to(slope, found.shape), atol=1e-12)
     with pytest.raises(ValueError, match="displacement: expected shape"):
         displacement_gradients(any_beam, np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["hexahedron", "tetrahedron"])
+def test_nodal_volumes_integrate_what_nodes_interpolate(cell: str, degree: int) -> None:
+    """They add up to the volume, and integrate a linear field exactly: its mean is at the centre of a box."""
+    body = beam((3, 2, 2), (0.3, 0.1, 0.2), cell)
+    if degree == 2:
+        body = body.quadratic()
+    volumes = nodal_volumes(body)
+    assert volumes.sum() == pytest.approx(0.3 * 0.1 * 0.2, rel=1e-12)
+    centre = 0.5 * (body.points.min(axis=0) + body.points.max(axis=0))
+    np.testing.assert_allclose(volumes @ body.points / volumes.sum(), centre, rtol=1e-12)

@@ -20,6 +20,7 @@ from softtwin.registration.parameters.inputs import InputBlocks
 from softtwin.registration.parameters.poisson_ratio import PoissonRatio
 from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.parameters.prescribed_motion import PrescribedMotion
+from softtwin.registration.parameters.weight import Weight
 from softtwin.registration.parameters.young_modulus import YoungModulus
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import prepare
@@ -44,6 +45,7 @@ def everything(body: Body) -> InputBlocks:
         PoissonRatio(0.7),
         PrescribedMotion("tip", 0.1, 0.02),
         Contact(body.boundary_nodes, np.array([0.5, 0.1, 0.2]), 0.1, 0.06, 2.0),
+        Weight(tip_forces(body, (0.1, 0.0, -2.0)), 0.6),
     )
     return InputBlocks(body, {"young_modulus": moduli, "poisson_ratio": 0.45}, unknowns)
 

@@ -1,0 +1,112 @@
+"""Forces along the surface's normal alone, a weight known but for a factor: what holds by itself, what is found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.metrics import nodal_volumes
+from softtwin.meshes.shapes import beam
+from softtwin.reference.data.materials import LinearElastic
+from softtwin.registration.options import expected_force, options_for
+from softtwin.registration.parameters.inputs import InputBlocks
+from softtwin.registration.parameters.nodal_forces import nodal_forces, normal_forces
+from softtwin.registration.parameters.weight import Weight
+from softtwin.registration.registrar import prepare
+from softtwin.surrogate.equilibria import Equilibria
+from softtwin.surrogate.equilibria_model import EquilibriaModel
+
+Floats = NDArray[np.float64]
+MODULUS, NOISE = 3000.0, 3e-4
+
+
+@pytest.fixture(scope="module")
+def block() -> Body:
+    """A block that is held at one end, seen from all sides."""
+    return beam((6, 4, 4), (0.3, 0.2, 0.2), "tetrahedron")
+
+
+@pytest.fixture(scope="module")
+def model(block: Body) -> EquilibriaModel:
+    return EquilibriaModel(Equilibria(block, LinearElastic(MODULUS, 0.3)))
+
+
+def area_vectors(body: Body) -> Floats:
+    """A third of the area of the triangles about each node, outward, (n, 3)."""
+    corners = body.points[body.boundary]
+    found = np.zeros_like(body.points)
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 6.0
+    np.add.at(found, body.boundary.ravel(), np.repeat(areas, 3, axis=0))
+    return found
+
+
+def whole_cloud(body: Body, displacement: Floats, rng: np.random.Generator, count: int = 800) -> Floats:
+    chosen = body.boundary[rng.integers(len(body.boundary), size=count)]
+    points = np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), size=count), (body.points + displacement)[chosen])
+    return points + NOISE * rng.standard_normal(points.shape)
+
+
+def test_each_nodes_force_is_along_its_normal(block: Body) -> None:
+    forces = normal_forces(block, block.boundary_nodes, smoothness=0.05)
+    normals = area_vectors(block)[forces.nodes]
+    patterns = forces.patterns.reshape(len(forces.nodes), 3, -1)
+    across = np.cross(patterns, normals[:, :, None], axisa=1, axisb=1)
+    assert np.abs(across).max() < 1e-12 * np.abs(patterns).max()
+    sizes = np.linalg.norm(patterns[:, :, 0], axis=1) / np.linalg.norm(normals, axis=1)
+    np.testing.assert_allclose(sizes, sizes[0], rtol=1e-12)  # the first is one pressure all over
+    assert not np.intersect1d(forces.nodes, block.fixed).size
+
+
+@pytest.mark.parametrize("made", [normal_forces, nodal_forces])
+def test_what_cannot_carry_force_is_refused_by_name(made, block: Body) -> None:
+    with pytest.raises(ValueError, match=rf"{made.__name__}.nodes: expected nodes on the free boundary"):
+        made(block, block.fixed)
+    with pytest.raises(ValueError, match=rf"{made.__name__}.smoothness: expected a length of 0 m or more, got -1"):
+        made(block, block.boundary_nodes, smoothness=-1.0)
+
+
+def test_a_pressure_is_found_inside_too(block: Body, model: EquilibriaModel, rng: np.random.Generator) -> None:
+    """A body pressed together from all sides, and a dent: forces of any direction slide along the surface, it does not.
+
+    The error inside is that of places that no point of the cloud shows.
+    """
+    middle = block.points - [0.2, 0.2, 0.1]
+    pressure = 900.0 + 400.0 * np.exp(-np.square(middle).sum(axis=1) / (2.0 * 0.06**2))
+    is_free = ~np.isin(np.arange(len(block.points)), block.fixed)
+    truth = model.solve(-(pressure * is_free)[:, None] * area_vectors(block)).displacement
+    cloud = whole_cloud(block, truth, rng)
+    assert np.linalg.norm(truth, axis=1).max() > 0.02
+    errors = {}
+    for along in (True, False):
+        registrar = prepare(
+            model,
+            block.boundary_nodes,
+            force_scale=expected_force(block, MODULUS),
+            smoothness=0.05,
+            options=options_for(model, True),
+            along_normals=along,
+        )
+        found = registrar.register(cloud)
+        errors[along] = np.linalg.norm(found.displacement - truth, axis=1)
+        if along:
+            inside = np.setdiff1d(np.arange(len(block.points)), block.boundary_nodes)
+            assert errors[True][inside].mean() < 1e-3
+            margins = found.camera_uncertainty.margin(confidence=0.95)
+            assert np.mean((errors[True] < margins)[is_free]) > 0.9
+    assert errors[True].mean() < 0.5 * errors[False].mean()
+
+
+def test_a_weight_is_found_by_its_factor(block: Body, model: EquilibriaModel, rng: np.random.Generator) -> None:
+    """Where nothing else acts, the factor is told to a few parts in a hundred, whatever was expected."""
+    weight = nodal_volumes(block)[:, None] * np.array([0.0, 0.0, -2000.0])
+    weight[block.fixed] = 0.0
+    cloud = whole_cloud(block, model.solve(1.8 * weight).displacement, rng)
+    inputs = InputBlocks(block, {"young_modulus": MODULUS, "poisson_ratio": 0.3}, (Weight(weight, 0.7),))
+    registrar = prepare(model, None, force_scale=1.0, options=options_for(model, True), inputs=inputs)
+    found = registrar.register(cloud)
+    (known,) = found.estimates
+    assert known.name == "weight" and known.value == pytest.approx(1.8, rel=0.03)
+    assert known.interval[0] < 1.8 < known.interval[1]
+    assert known.variance_reduction > 0.9
