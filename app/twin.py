@@ -27,7 +27,13 @@ from softtwin.registration.contact import ContactRegistrar
 from softtwin.registration.forward import ForwardModel, State
 from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.lbfgs import LBFGS
-from softtwin.registration.options import RegistrationOptions, expected_force, noise_prior, options_for
+from softtwin.registration.options import (
+    RegistrationOptions,
+    expected_force,
+    expected_pressure,
+    noise_prior,
+    options_for,
+)
 from softtwin.registration.parameters.inputs import InputBlocks
 from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.penalties import PENALTIES
@@ -505,6 +511,7 @@ class Twin:
             raise ConfigError(f"registration.zone: expected one of {sorted(body.node_sets)}, got {zone!r}.")
         loaded = loaded_nodes(body, load_plan(self.config))
         nodes = None if section.forces == "known" else body.node_sets[zone] if zone else loaded
+        expected = expected_pressure if section.forces == "normal" else expected_force
         inputs = self._inputs(model)
         if nodes is not None and inputs is not None and not len(np.setdiff1d(nodes, inputs.moved_nodes)):
             raise ConfigError(
@@ -515,7 +522,7 @@ class Twin:
             model,
             nodes,
             body.surfaces.get("observed"),
-            force_scale=section.force_scale or expected_force(body, self.config.material.young_modulus),
+            force_scale=section.force_scale or expected(body, self.config.material.young_modulus),
             smoothness=section.smoothness,
             directions=section.directions,
             options=_options(section, options_for(model, bool(zone) or section.forces == "normal")),

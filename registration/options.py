@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.embedding import outer, outer_nodes
 from softtwin.meshes.metrics import edge_lengths
 
 from .forward import ForwardModel
@@ -124,3 +125,14 @@ def expected_force(body: Body, young_modulus: float) -> float:
     """Nodal force to begin with, newtons: a part of Young's modulus (Pa) times the square of a typical edge."""
     edge = float(np.median(edge_lengths(body.points, body.cells)))
     return POLICY.force_size * young_modulus * edge**2
+
+
+def expected_pressure(body: Body, young_modulus: float) -> float:
+    """Force of an unknown pressure's changes at a node to begin with, newtons: Young's modulus (Pa) on a node's area.
+
+    What surrounds an organ and slides along it changes its shape as a whole: pressures are as large as it is stiff.
+    """
+    surface = outer(body).rest
+    corners = surface.points[surface.triangles]
+    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return young_modulus * float(areas.sum()) / len(outer_nodes(body))
