@@ -1,4 +1,4 @@
-"""A measured lung by the setting that the documents show: nearer than a shape carried alone, and how far off is told."""
+"""A measured lung by the setting that documents show: nearer than a shape carried alone, and how far off is told."""
 
 from __future__ import annotations
 
