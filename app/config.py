@@ -436,7 +436,10 @@ class RegistrationSection(Section):
             models = ["reference", "hybrid", "torch"]
         if self.known_forces:  # they are added to those that the network is asked for, where both engines know of them
             models = [model for model in models if model != "surrogate"]
-        if any(self.gravity) or self.pressure or "moved" in kinds or self.forces == "known":
+        if "weight" in kinds:  # it is among the nodal forces then
+            models = ["reference", "torch"]
+        has_weight = any(self.gravity) and "weight" not in kinds
+        if has_weight or self.pressure or "moved" in kinds or self.forces == "known":
             models = ["reference"]  # a network has one support, and no load inside or that follows the surface
         if self.model not in models:
             raise ValueError(

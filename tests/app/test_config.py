@@ -52,6 +52,10 @@ def test_every_entry_says_what_it_means() -> None:
             {"registration": {"model": "reference", "parameters": ["weight=0.5"]}},
             r"registration\.parameters: expected gravity beside weight, got none",
         ),
+        (
+            {"registration": {"model": "hybrid", "parameters": ["weight"], "gravity": [0.0, 0.0, -9.81]}},
+            r"registration\.model: expected reference or torch with these parameters and known loads",
+        ),
         ({"body": {"unit": "inch"}}, r"body\.unit: expected one of m, cm, mm, got 'inch'"),
         ({"samples": {"train": 0}}, r"samples\.train: expected a whole number >= 1, got 0"),
         ({"loads": {"radius": [0.5, 0.1]}}, r"\n  loads\.radius: expected smallest <= largest, got \(0\.5, 0\.1\)$"),
