@@ -133,7 +133,7 @@ class DerivativeForms:
                     lambda pressed=pressed: ufl.derivative(pressed, self.space.state, self._test()),
                 )
             )
-        return self.forms.assembled(*parts)
+        return self.forms.assembled(*parts) + self.forms.spring_forces(a)
 
     def by_loads(
         self, state: Floats, a: Floats, loading: Loading

@@ -96,7 +96,14 @@ class Linearisation:
         Args:
             cotangent: derivative of J by the displacement, (n, 3).
             points: also with respect to the node positions at rest.
+
+        Raises:
+            ValueError: node positions of a body on springs, which turn with the surface at rest.
         """
+        if points and self._system.springs:
+            raise ValueError(
+                "Linearisation.gradient.points: expected a body without springs, got springs; ask without."
+            )
         g = self._space.unknowns("Linearisation.cotangent", cotangent)
         a = self._adjoint(g)
         return self._gradient(g, a, points)

@@ -54,7 +54,8 @@ class CellSum:
         to = np.asarray(place[rows, columns]).ravel()
         shape = (entries, unknowns.shape[0] * unknowns.shape[1] ** 2)
         self._sum = coo_matrix((np.ones(len(to)), (to, wanted)), shape=shape).tocsr()
-        self._ones = np.asarray(place[space.fixed, space.fixed]).ravel()
+        held = space.fixed  # no unknown need be, where springs hold the body
+        self._ones = np.asarray(place[held, held]).ravel() if len(held) else np.zeros(0, dtype=np.int64)
 
     def create_matrix(self) -> Any:
         """A PETSc matrix of zeros."""

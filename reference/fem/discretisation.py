@@ -16,6 +16,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.elements import Kind, linear_kind
 
 from ..data.loading import checked_array
+from ..data.springs import Springs
 from .fenicsx import (
     MPI,
     cell_dofs,
@@ -48,9 +49,17 @@ class Discretisation:
         mixed: with the pressure as an unknown (Taylor-Hood).
         held: axes held at named node sets, `{"fixed": "xyz"}`.
         comm: ranks that share the mesh.
+        springs: that hold named surfaces.
     """
 
-    def __init__(self, body: Body, mixed: bool, held: Mapping[str, str], comm: Any = MPI.COMM_SELF) -> None:
+    def __init__(
+        self,
+        body: Body,
+        mixed: bool,
+        held: Mapping[str, str],
+        comm: Any = MPI.COMM_SELF,
+        springs: Mapping[str, Springs] | None = None,
+    ) -> None:
         self.body, self.mixed, self.comm = body, mixed, comm
         kind = linear_kind(body.kind) if body.is_straight else body.kind
         self.mesh = create_mesh(body.points, body.cells[:, : kind.nodes], kind, comm)
@@ -58,6 +67,7 @@ class Discretisation:
         self._make_spaces()
         self.state = fem.Function(self.space)
         self.held = _held_axes(body, held)
+        _check_rigid(body, self.held, springs or {})
         self.band_order: Ints | None = None  # linear.py keeps its order here, for all matrices of the body
         self._hold()
 
@@ -239,7 +249,6 @@ def _held_axes(body: Body, held: Mapping[str, str]) -> NDArray[np.bool_]:
             raise ValueError(f"Problem.held[{name!r}]: expected letters of {axes!r}, got {which!r}.")
         for letter in which:
             mask[body.node_sets[name], axes.index(letter)] = True
-    _check_rigid(body, mask)
     return mask
 
 
@@ -256,13 +265,27 @@ def rigid_motions(points: Floats) -> Floats:
     return np.array(motions)
 
 
-def _check_rigid(body: Body, mask: NDArray[np.bool_]) -> None:
+def _sprung(body: Body, name: str, springs: Springs, motions: Floats) -> Floats:
+    """What springs resist of rigid motions, (m, k): their parts across and along a surface at the facets' corners."""
+    facets = body.facets if name == "boundary" else body.facets_of(name)
+    corners = facets[:, : len(linear_kind(body.kind).facets[0])]
+    edges = body.points[corners[:, 1:]] - body.points[corners[:, :1]]
+    normals = np.cross(edges[:, 0], edges[:, 1]) if body.dimension == 3 else edges[:, 0][:, ::-1] * [1.0, -1.0]
+    normals = normals / np.linalg.norm(normals, axis=1)[:, None]
+    moved = motions[:, corners]
+    across = np.einsum("mfci,fi->mfc", moved, normals)
+    along = moved - across[..., None] * normals[:, None]
+    parts = [across.reshape(len(motions), -1)] * (springs.normal > 0.0)
+    return np.hstack([*parts, *[along.reshape(len(motions), -1)] * (springs.tangential > 0.0)])
+
+
+def _check_rigid(body: Body, mask: NDArray[np.bool_], springs: Mapping[str, Springs]) -> None:
     motions = rigid_motions(body.points)
-    held = motions[:, mask]
+    held = np.hstack([motions[:, mask], *(_sprung(body, name, each, motions) for name, each in springs.items())])
     left = len(motions) - (int(np.linalg.matrix_rank(held, tol=1e-9 * np.sqrt(len(body.points)))) if held.size else 0)
     if left:
         raise ValueError(
             f"Problem.held: expected no rigid motion to be left, got {left} of {len(motions)} "
-            f"(translations and rotations) with {int(mask.any(axis=1).sum())} held nodes; without a support there is "
-            "no equilibrium."
+            f"(translations and rotations) with {int(mask.any(axis=1).sum())} held nodes and springs on "
+            f"{sorted(springs) or 'no surface'}; without a support there is no equilibrium."
         )

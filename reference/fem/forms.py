@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,7 @@ from softtwin.meshes.quadrature import quadrature_degree
 
 from ..data.loading import Loading
 from ..data.materials import Energy, Material, Parameter, is_same_law
+from ..data.springs import Springs
 from .assembly import CellSum, suits
 from .discretisation import Discretisation
 from .fenicsx import (
@@ -71,10 +73,16 @@ class Forms:
         material: strain energy.
         weights: factor of each cell's energy, (cells,), the part of the cell that is filled; None for 1.
         degree: of the quadrature; None for the least that is safe.
+        springs: that hold named surfaces.
     """
 
     def __init__(
-        self, space: Discretisation, material: Material, weights: Floats | None = None, degree: int | None = None
+        self,
+        space: Discretisation,
+        material: Material,
+        weights: Floats | None = None,
+        degree: int | None = None,
+        springs: Mapping[str, Springs] | None = None,
     ) -> None:
         self.space, self.material = space, material
         self.degree = degree or quadrature_degree(space.body, material.is_mixed)
@@ -88,6 +96,7 @@ class Forms:
         self.direction = fem.Function(space.space)
         self.reactions = np.zeros(len(space.fixed))  # at held unknowns, where the residual was last asked for
         self._compile()
+        self.springs = [_SpringForms(self, name, each) for name, each in (springs or {}).items()]
 
     def parameter(self, name: str, value: Parameter) -> Any:
         """A parameter as forms read it: a number that another may replace without compiling, or one for each cell."""
@@ -200,7 +209,8 @@ class Forms:
     def residual(self, unknowns: Floats, load: DiscreteLoad) -> Floats:
         """Out-of-balance forces; at held unknowns their distance from where they should be."""
         self.space.set_state(unknowns)
-        out = self.assembled(self._residual, *(s.pressure_form for s in self._pressed(load))) - load.dead
+        further = [*(s.force_form for s in self.springs), *(s.pressure_form for s in self._pressed(load))]
+        out = self.assembled(self._residual, *further) - load.dead
         fixed = self.space.fixed
         self.reactions = out[fixed]
         out[fixed] = unknowns[fixed] - load.lift[fixed]
@@ -218,11 +228,23 @@ class Forms:
             assemble_matrix(matrix, self.tangent_form, self.space.conditions)
         else:
             self._cell_sum.assemble(matrix)
+        for springs in self.springs:
+            add_matrix(matrix, facet_matrix(springs.stiffness_form, self.space.fixed))
         for surface in self._pressed(load):
             add_matrix(matrix, facet_matrix(surface.pressure_tangent, self.space.fixed))
 
     def tangent_times(self, unknowns: Floats, direction: Floats) -> Floats:
-        """The stiffness of the strain energy times a direction, held unknowns included."""
+        """The stiffness of body and springs times a direction, held unknowns included."""
+        return self._body_tangent_times(unknowns, direction) + self.spring_forces(direction)
+
+    def spring_forces(self, unknowns: Floats) -> Floats:
+        """Forces that springs need to be pulled so far, linear in it."""
+        if not self.springs:
+            return np.zeros(self.space.owned)
+        self.space.set_state(unknowns)
+        return self.assembled(*(springs.force_form for springs in self.springs))
+
+    def _body_tangent_times(self, unknowns: Floats, direction: Floats) -> Floats:
         if self._tangent_action is None:
             self._tangent_action = form(ufl.action(self._tangent_expression, self.direction))
         self.space.set_state(unknowns)
@@ -236,8 +258,10 @@ class Forms:
         return energy if energy < _MOST else np.inf
 
     def potential(self, unknowns: Floats, load: DiscreteLoad) -> float:
-        """Strain energy minus the work of dead forces, joules."""
-        return self.energy(unknowns) - self.space.dot(load.dead, unknowns)
+        """Strain energy, and that of springs, minus the work of dead forces, joules."""
+        stored = self.energy(unknowns)
+        stored += sum(scalar(springs.energy_form, self.space.comm) for springs in self.springs)
+        return stored - self.space.dot(load.dead, unknowns)
 
     def pressed(self, unknowns: Floats, load: DiscreteLoad) -> Floats:
         """What following pressures add to the residual."""
@@ -302,12 +326,27 @@ class Forms:
         stretch = np.zeros_like(points)
         stretch[:, 0] = points[:, 0] - points[:, 0].mean()
         v = self.space.unknowns("stretch", stretch)
-        product = self.tangent_times(np.zeros(self.space.owned), v)
+        product = self._body_tangent_times(np.zeros(self.space.owned), v)
         return abs(self.space.dot(product, v)) / self.space.body.volume
 
     def close(self) -> None:
         """Free the PETSc objects."""
         self._vector.destroy()
+
+
+class _SpringForms:
+    """Energy, forces and stiffness of springs on one named surface."""
+
+    def __init__(self, forms: Forms, name: str, springs: Springs) -> None:
+        space = forms.space
+        u, _ = forms.split(space.state)
+        across = ufl.inner(u, ufl.FacetNormal(space.mesh))
+        self.ds = ds = space.facet_measure(name, max(forms.degree, 2 * space.body.kind.degree))
+        k_n, k_t = constant(space.mesh, springs.normal), constant(space.mesh, springs.tangential)
+        energy = 0.5 * (k_n * across**2 + k_t * (ufl.inner(u, u) - across**2)) * ds
+        force = ufl.derivative(energy, space.state, ufl.TestFunction(space.space))
+        self.energy_form, self.force_form = form(energy), form(force)
+        self.stiffness_form = form(ufl.derivative(force, space.state, ufl.TrialFunction(space.space)))
 
 
 class _SurfaceForms:

@@ -16,6 +16,7 @@ from softtwin.meshes.body import Body
 from ..data.loading import Loading
 from ..data.materials import Material
 from ..data.outcome import Equilibrium, NotConverged
+from ..data.springs import Springs
 from ..fem.fenicsx import MPI, assemble_matrix, create_matrix, form, ufl
 from ..fem.forms import DiscreteLoad
 from .continuation import in_load_steps
@@ -24,7 +25,7 @@ from .path import LoadPath
 from .start import Proposal, Starts
 from .system import System
 
-__all__ = ["Loading", "NewtonOptions", "Problem"]
+__all__ = ["Loading", "NewtonOptions", "Problem", "Springs"]
 
 Floats = NDArray[np.float64]
 _FIRST_STEP = 0.25  # of the load where the whole load has failed
@@ -48,9 +49,11 @@ class Problem:
         weights: factor of each cell's energy, (cells,), in (0, 1], in place of the body's own fractions.
         quadrature: polynomial degree that the quadrature is exact for; the least that is safe if not given.
         comm: communicator that shares the mesh; each rank on its own if not given.
+        springs: that hold named surfaces (`boundary`: all of it) and give way, beside what is held.
 
     Raises:
-        ValueError: a rigid motion is left, a parameter with another number of cells, a mixed material on linear cells.
+        ValueError: a rigid motion is left, a parameter with another number of cells, a mixed material on linear cells,
+            springs on a surface that is not there.
     """
 
     def __init__(
@@ -63,11 +66,12 @@ class Problem:
         weights: ArrayLike | None = None,
         quadrature: int | None = None,
         comm: Any = MPI.COMM_SELF,
+        springs: Mapping[str, Springs] | None = None,
     ) -> None:
         self.options = options or NewtonOptions()
         everything = "xyz"[: body.dimension]
         kept = dict(held) if held is not None else ({"fixed": everything} if "fixed" in body.node_sets else {})
-        self.system = System(body, material, kept, weights, quadrature, self.options.linear, comm)
+        self.system = System(body, material, kept, weights, quadrature, self.options.linear, comm, springs)
         self._space = self.system.space
         self._newton = Newton(self.system.forms, self.system.tangent, self.options)
         self._starts = Starts(self.system)

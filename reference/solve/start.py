@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.outcome import Equilibrium
-from ..fem.fenicsx import assemble_matrix, create_matrix, form, ufl
+from ..fem.fenicsx import add_matrix, assemble_matrix, create_matrix, facet_matrix, form, ufl
 from ..fem.forms import DiscreteLoad
 from .linear import LinearSolver
 from .path import LoadPath
@@ -49,7 +49,7 @@ class Starts:
         self._system, self._space, self._forms = system, system.space, system.forms
         self._rest: LinearSolver | None = None
         self._poisson: LinearSolver | None = None
-        self._warped_form: Any = None
+        self._warped_forms: list[Any] = []
 
     def close(self) -> None:
         """Free the PETSc objects."""
@@ -246,7 +246,7 @@ class Starts:
             self._poisson = self._prepare_warping()
         space.set_state(linear)
         space.set_function(self._forms.direction, load.lift)
-        right = self._forms.assembled(self._warped_form)
+        right = self._forms.assembled(*self._warped_forms)
         right[space.fixed] = 0.0
         return load.lift + self._poisson.solve(right[None])[0]
 
@@ -257,9 +257,13 @@ class Starts:
         laplacian = form((energy + p * q if space.mixed else energy) * dx)  # pressures are kept out of it
         state, direction = split(space.state)[0], split(self._forms.direction)[0]
         missing = _warped_gradient(space.gradient(state)) - space.gradient(direction)
-        self._warped_form = form(ufl.inner(missing, space.gradient(test)) * dx)
+        warped = [ufl.inner(missing, space.gradient(test)) * dx]
         matrix = create_matrix(laplacian)
         assemble_matrix(matrix, laplacian, space.conditions)
+        for springs in self._forms.springs:  # they hold the field where the linear response has it
+            add_matrix(matrix, facet_matrix(form(ufl.inner(trial, test) / space.body.size * springs.ds), space.fixed))
+            warped.append(ufl.inner(state - direction, test) / space.body.size * springs.ds)
+        self._warped_forms = [form(part) for part in warped]
         return factored(matrix, self._system.tangent, turns=False)
 
 

@@ -15,6 +15,7 @@ from softtwin.meshes.body import Body
 from ..data.loading import Loading, checked_loading
 from ..data.materials import Material
 from ..data.outcome import Equilibrium
+from ..data.springs import Springs, checked_springs
 from ..fem.discretisation import Discretisation
 from ..fem.forms import DiscreteLoad, Forms
 from .linear import Method
@@ -35,6 +36,7 @@ class System:
         quadrature: polynomial degree that the quadrature is exact for; None for the least that is safe.
         method: linear algebra.
         comm: communicator that shares the mesh.
+        springs: that hold named surfaces.
 
     Raises:
         ValueError: as `Problem` says.
@@ -49,6 +51,7 @@ class System:
         quadrature: int | None,
         method: Method,
         comm: Any,
+        springs: Mapping[str, Springs] | None = None,
     ) -> None:
         if material.is_mixed and body.kind.degree != 2:
             raise ValueError(
@@ -56,9 +59,10 @@ class System:
                 f"displacement one degree above the pressure), got {body.kind.name}; body.quadratic() makes them."
             )
         self.body, self.held = body, dict(held)
-        self.space = Discretisation(body, material.is_mixed, self.held, comm)
+        self.springs = checked_springs(springs or {}, body)
+        self.space = Discretisation(body, material.is_mixed, self.held, comm, self.springs)
         checked = body.fractions if weights is None else _checked_weights(weights, len(body.cells))
-        self.forms = Forms(self.space, material, checked, quadrature)
+        self.forms = Forms(self.space, material, checked, quadrature, self.springs)
         self.tangent = Tangent(self.forms, method)
 
     @property
