@@ -171,11 +171,4 @@ def buoyancy(body: Body, weight: Floats) -> Floats:
         weight: force per volume, (3,), N/m^3.
     """
     surface = outer(body)
-    triangles = surface.rest.triangles
-    corners = surface.rest.points[triangles]
-    areas = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    depths = (corners - body.points.mean(axis=0)) @ weight
-    shares = (depths + depths.sum(axis=1, keepdims=True)) / 12.0  # of a pressure that is linear in each triangle
-    of_vertices = np.zeros_like(surface.rest.points)
-    np.add.at(of_vertices, triangles.ravel(), -(shares[:, :, None] * areas[:, None, :]).reshape(-1, 3))
-    return surface.spread(of_vertices)
+    return -surface.along_normals((surface.rest.points - body.points.mean(axis=0)) @ weight)

@@ -126,6 +126,20 @@ class Outer:
         """Nodal forces, (n, k), that do the same work as forces on the vertices, (v, k)."""
         return forces if self.weights is None else self.weights.T @ forces
 
+    def along_normals(self, traction: Floats) -> Floats:
+        """Nodal forces, (n, 3), newtons, of an outward traction along the normal at rest, linear in each triangle.
+
+        Args:
+            traction: at the vertices, (v,), pascals.
+        """
+        triangles = self.rest.triangles
+        corners, values = self.rest.points[triangles], traction[triangles]
+        areas = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        shares = (values + values.sum(axis=1, keepdims=True)) / 12.0
+        forces = np.zeros_like(self.rest.points)
+        np.add.at(forces, triangles.ravel(), (shares[:, :, None] * areas[:, None, :]).reshape(-1, 3))
+        return self.spread(forces)
+
     def moved(self, displacement: ArrayLike) -> Surface:
         """The surface after the nodes have moved.
 

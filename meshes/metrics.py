@@ -304,13 +304,16 @@ def cell_volumes(points: Floats, cells: Ints) -> Floats:
 def nodal_volumes(body: Body) -> Floats:
     """Integral of each node's shape function over the body, (n,), cubic metres: they add up to its volume.
 
+    Of a sparse grid the filled part of each cell, as for its energy and its weight.
+
     Args:
         body: the body.
     """
     points, weights = quadrature(body.kind, quadrature_degree(body))
     values, slopes = shape_functions(body.kind, points)
     jacobians = np.linalg.det(np.einsum("cki,qkj->cqij", body.points[body.cells], slopes))
-    shares = np.einsum("cq,q,qk->ck", jacobians, weights, values)
+    filled = np.ones(len(body.cells)) if body.fractions is None else body.fractions
+    shares = np.einsum("c,cq,q,qk->ck", filled, jacobians, weights, values)
     found: Floats = np.bincount(body.cells.ravel(), shares.ravel(), minlength=len(body.points)).astype(np.float64)
     return found
 

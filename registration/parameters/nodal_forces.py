@@ -181,11 +181,7 @@ def normal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, s
     """
     chosen = _free_boundary("normal_forces", body, nodes, smoothness)
     surface = outer(body)
-    corners = surface.rest.points[surface.rest.triangles]
-    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 6.0
-    of_vertices = np.zeros_like(surface.rest.points)
-    np.add.at(of_vertices, surface.rest.triangles.ravel(), np.repeat(areas, 3, axis=0))
-    normals = surface.spread(of_vertices)[chosen]
+    normals = surface.along_normals(np.ones(len(surface.rest.points)))[chosen]
     normals /= np.linalg.norm(normals, axis=1).mean()
     pressures = _correlation_root(body.points[chosen], smoothness)
     pressures = np.hstack([np.full((len(chosen), 1), _UNIFORM), pressures])

@@ -149,3 +149,10 @@ def test_nodal_volumes_integrate_what_nodes_interpolate(cell: str, degree: int) 
     assert volumes.sum() == pytest.approx(0.3 * 0.1 * 0.2, rel=1e-12)
     centre = 0.5 * (body.points.min(axis=0) + body.points.max(axis=0))
     np.testing.assert_allclose(volumes @ body.points / volumes.sum(), centre, rtol=1e-12)
+
+
+def test_nodal_volumes_of_a_sparse_grid_are_of_what_is_filled() -> None:
+    body = beam((3, 2, 2), (0.3, 0.1, 0.2), "hexahedron")
+    half = Body(body.points, body.cells, body.node_sets, fractions=np.linspace(0.2, 1.0, len(body.cells)))
+    assert nodal_volumes(half).sum() == pytest.approx(half.volume, rel=1e-12)
+    assert half.volume < 0.7 * body.volume
