@@ -35,8 +35,8 @@ from .fenicsx import (
 
 Floats = NDArray[np.float64]
 
-_INSIDE_OUT = 1e250  # energy per volume of what is turned inside out, J/m^3; times any cell's volume it is above
-_MOST = 1e200  # joules
+INSIDE_OUT = 1e250  # energy per volume of what is turned inside out, J/m^3; times any cell's volume it is above
+MOST = 1e200  # joules
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +139,7 @@ class Forms:
         if not self.material.is_linear:
             # Asked for and not left to NaN, which compilers may take for impossible (-ffast-math).
             is_turned = ufl.le(ufl.det(self.space.deformation_gradient(u)), 0.0)
-            guarded = ufl.conditional(is_turned, _INSIDE_OUT, psi)
+            guarded = ufl.conditional(is_turned, INSIDE_OUT, psi)
         residual = ufl.derivative(psi * self.dx, self.space.state, ufl.TestFunction(self.space.space))
         tangent = ufl.derivative(residual, self.space.state, ufl.TrialFunction(self.space.space))
         self._energy = form(guarded * self.dx)
@@ -255,7 +255,7 @@ class Forms:
         """Strain energy, joules; infinite where a cell is inside out."""
         self.space.set_state(unknowns)
         energy = scalar(self._energy, self.space.comm)
-        return energy if energy < _MOST else np.inf
+        return energy if energy < MOST else np.inf
 
     def potential(self, unknowns: Floats, load: DiscreteLoad) -> float:
         """Strain energy, and that of springs, minus the work of dead forces, joules."""
@@ -342,7 +342,8 @@ class _SpringForms:
         u, _ = forms.split(space.state)
         across = ufl.inner(u, ufl.FacetNormal(space.mesh))
         self.ds = ds = space.facet_measure(name, max(forms.degree, 2 * space.body.kind.degree))
-        k_n, k_t = constant(space.mesh, springs.normal), constant(space.mesh, springs.tangential)
+        self.normal = k_n = constant(space.mesh, springs.normal)
+        self.tangential = k_t = constant(space.mesh, springs.tangential)
         energy = 0.5 * (k_n * across**2 + k_t * (ufl.inner(u, u) - across**2)) * ds
         force = ufl.derivative(energy, space.state, ufl.TestFunction(space.space))
         self.energy_form, self.force_form = form(energy), form(force)

@@ -139,12 +139,8 @@ class Newton:
         nothing = np.zeros(self.space.owned)
         at_rest = self.space.norm(self.forms.residual(nothing, DiscreteLoad.none(self.space)))
         self._round_off = _EPSILONS * at_rest  # what rounding leaves of the stresses of a body at rest
-        body, epsilon = self.space.body, float(_EPSILONS * np.finfo(float).eps)
-        modulus = self.forms.stiffness_scale()
-        self._energy_noise = epsilon * modulus * body.volume
-        # F is 1 + grad u: its rounding is a strain, and a random force at each node on the area that belongs to it.
-        nodes, dimension = body.points.shape
-        self._force_noise = epsilon * modulus * (body.volume / nodes) ** (1 - 1 / dimension) * nodes**0.5
+        self._force_noise = force_rounding(self.forms)
+        self._energy_noise = _strain_rounding(self.forms) * self.space.body.volume
 
     def start_count(self) -> None:
         """Forget the counts and the trace of the last solve."""
@@ -404,3 +400,18 @@ def _interrupts() -> Iterator[None]:
         if isinstance(cause, KeyboardInterrupt):
             raise cause from None
         raise
+
+
+def force_rounding(forms: Forms) -> float:
+    """What rounding leaves of nodal forces that balance, newtons.
+
+    F is 1 + grad u: its rounding is a strain, and a random force at each node on the area that belongs to it.
+    """
+    body = forms.space.body
+    nodes, dimension = body.points.shape
+    return _strain_rounding(forms) * float((body.volume / nodes) ** (1 - 1 / dimension) * nodes**0.5)
+
+
+def _strain_rounding(forms: Forms) -> float:
+    """Stress of a strain as large as rounding, pascals."""
+    return float(_EPSILONS * np.finfo(float).eps) * forms.stiffness_scale()
