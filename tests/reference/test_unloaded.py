@@ -1,6 +1,8 @@
-"""The organ before gravity: forward and back on every kind of body, load and support; the fixed point; no such shape."""
+"""The organ before gravity: forward and back on every kind of body, load, support; the fixed point; no such shape."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ SIZE = (0.3, 0.1, 0.1)
 NEAR = 1e-8  # metres
 
 
-def bar(cell: str, quadratic: bool = False) -> Body:
+def bar(cell: Literal["hexahedron", "tetrahedron"], quadratic: bool = False) -> Body:
     """A bar along x, with the surface of its end and of one side."""
     made = beam((5, 2, 2), SIZE, cell)
     made = made.quadratic() if quadratic else made
@@ -50,7 +52,7 @@ def back_again(body: Body, material: Material, load: Loading, **how: object) -> 
 @pytest.mark.parametrize(
     ("cell", "quadratic"), [("tetrahedron", False), ("hexahedron", False), ("tetrahedron", True), ("hexahedron", True)]
 )
-def test_weight_is_taken_off_whatever_the_cells(cell: str, quadratic: bool) -> None:
+def test_weight_is_taken_off_whatever_the_cells(cell: Literal["hexahedron", "tetrahedron"], quadratic: bool) -> None:
     weight = np.array([0.0, 0.3 * WEIGHT, -0.2 * WEIGHT])
     back_again(bar(cell, quadratic), NeoHookean(2e5, 0.45), Loading(body_force=weight), quadrature=4)
 
