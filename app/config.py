@@ -360,7 +360,14 @@ class RegistrationSection(Section):
     )
     gravity: tuple[float, float, float] = option(
         (0.0, 0.0, 0.0),
-        "gravity beyond what acts on the undeformed body, on the axes of the files",
+        "gravity beyond what acts on the organ as the files show it, on their axes",
+        unit="m/s^2",
+        group="forces",
+    )
+    scan_gravity: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0),
+        "gravity under which the files show the organ, on their axes: its stress-free shape is found, and states are "
+        "equilibria of that; zeros: the files show it free of stress (reference only)",
         unit="m/s^2",
         group="forces",
     )
@@ -423,6 +430,16 @@ class RegistrationSection(Section):
         0, "points of the surface of each inner structure in mrk.json, beside its centre", ge=0, group="output"
     )
 
+    def _check_scan_gravity(self, kinds: list[str]) -> None:
+        """The stress-free shape is found once, for what is expected of the tissue."""
+        wrong = [kind for kind in kinds if kind in ("young-modulus", "poisson-ratio", "weight")]
+        wrong += ["forces = 'normal'"] * (self.forces == "normal")
+        if wrong:
+            raise ValueError(
+                "registration.scan_gravity: expected tissue and weight that are known, since the stress-free shape "
+                f"depends on them, got {', '.join(wrong)} beside it"
+            )
+
     @model_validator(mode="after")
     def _parameters_can_be_found(self) -> RegistrationSection:
         named = [NamedParameter.parse(text) for text in self.parameters]
@@ -439,7 +456,9 @@ class RegistrationSection(Section):
         if "weight" in kinds:  # it is among the nodal forces then
             models = ["reference", "torch"]
         has_weight = any(self.gravity) and "weight" not in kinds
-        if has_weight or self.pressure or "moved" in kinds or self.forces == "known":
+        if any(self.scan_gravity):
+            self._check_scan_gravity(kinds)
+        if has_weight or any(self.scan_gravity) or self.pressure or "moved" in kinds or self.forces == "known":
             models = ["reference"]  # a network has one support, and no load inside or that follows the surface
         if self.model not in models:
             raise ValueError(

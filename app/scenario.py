@@ -36,6 +36,7 @@ class Scenario:
         gravity: on the axes of the twin's files, (3,), m/s^2.
         pressure: on the whole boundary, pascals.
         density: kg/m^3.
+        scan_gravity: gravity under which the files show the organ, on their axes, (3,), m/s^2.
         floats: what surrounds the organ carries its weight by a pressure that grows with depth; the pressure that is
             unknown is beside it.
     """
@@ -45,6 +46,7 @@ class Scenario:
     gravity: tuple[float, float, float]
     pressure: float
     density: float
+    scan_gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     floats: bool = False
 
     @classmethod
@@ -57,6 +59,7 @@ class Scenario:
             section.gravity,
             section.pressure,
             config.material.density,
+            section.scan_gravity,
             section.forces == "normal",
         )
 
@@ -80,7 +83,7 @@ class Scenario:
         return {"fixed": "xyz", **dict.fromkeys(moved, "xyz")}
 
     def loading(self, body: Body, coordinates: Coordinates) -> Loading:
-        """What is known to act.
+        """What is known to act, that of the scan included.
 
         Args:
             body: the body.
@@ -96,7 +99,22 @@ class Scenario:
             carrying = buoyancy(body, weight)
             carrying[body.fixed] = 0.0  # what holds the organ carries the rest
             forces = carrying if forces is None else forces + carrying
+        in_scan = self.loading_of_scan(coordinates).body_force
+        if in_scan is not None:
+            weight = np.asarray(in_scan) + (0.0 if weight is None else weight)
         return Loading(forces, weight, pressure=pressure)
+
+    def loading_of_scan(self, coordinates: Coordinates) -> Loading:
+        """What acted when the organ was scanned.
+
+        Args:
+            coordinates: of the twin's files.
+        """
+        return Loading(body_force=self._force_of(self.scan_gravity, coordinates))
+
+    def _force_of(self, gravity: tuple[float, float, float], coordinates: Coordinates) -> Floats | None:
+        """Force per volume, (3,), N/m^3; None without gravity."""
+        return coordinates.directions(np.array(gravity)) * self.density if any(gravity) else None
 
     @property
     def unknown_weight(self) -> NamedParameter | None:
@@ -104,8 +122,7 @@ class Scenario:
         return next((named for named in self.parameters if named.kind == "weight"), None)
 
     def _weight(self, coordinates: Coordinates) -> Floats | None:
-        """Force per volume, (3,), N/m^3; None without gravity."""
-        return coordinates.directions(np.array(self.gravity)) * self.density if any(self.gravity) else None
+        return self._force_of(self.gravity, coordinates)
 
     def _known_forces(self, body: Body, coordinates: Coordinates) -> Floats | None:
         if self.forces is None:

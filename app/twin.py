@@ -55,6 +55,7 @@ from .workspace import open_workspace
 
 if TYPE_CHECKING:
     from softtwin.reference.data.materials import Material
+    from softtwin.reference.unloaded import Unloaded
     from softtwin.surrogate.equilibria_model import EquilibriaModel
     from softtwin.surrogate.error_bound import ErrorBound, ErrorEstimator
     from softtwin.surrogate.loaded import LoadedSurrogate
@@ -814,12 +815,35 @@ def forward_models(
         yield _solved_in_torch(body, material, loading.forces, further), None
         return
     from softtwin.reference.derivatives.model import ReferenceModel  # FEniCSx is needed here alone
+    from softtwin.reference.derivatives.scanned import ScannedModel
     from softtwin.reference.solve.problem import NewtonOptions, Problem
 
     options = NewtonOptions(tolerance=_TOLERANCE, max_iterations=_ITERATIONS)
-    with Problem(body, material, options, held=scenario.held) as problem:
+    behind = _unloaded(scenario, body, material, coordinates_of(config)) if any(scenario.scan_gravity) else None
+    with Problem(behind.body if behind else body, material, options, held=scenario.held) as problem:
         model = ReferenceModel(problem, patient=False, loading=loading, predictor=fast, discrepancy=further)
-        yield model, fast
+        yield ScannedModel(body, model, behind.displacement) if behind else model, fast
+
+
+def _unloaded(scenario: Scenario, body: Body, material: Material, coordinates: Coordinates) -> Unloaded:
+    """The stress-free body behind the scanned one.
+
+    Raises:
+        ConfigError: there is none, or it would not hang as the scan shows it.
+    """
+    from softtwin.reference.unloaded import unloaded  # FEniCSx is needed here alone
+
+    try:
+        found = unloaded(body, material, scenario.loading_of_scan(coordinates), held=scenario.held)
+    except NotConverged as error:
+        raise ConfigError(f"registration.scan_gravity: {error}") from None
+    if not found.is_stable:
+        raise ConfigError(
+            "registration.scan_gravity: expected an organ that hangs as the files show it, found a stress-free shape "
+            f"that gives way ({found.negative_pivots} negative pivots); is the material too soft, the support too "
+            "small, or the direction the opposite one?"
+        )
+    return found
 
 
 def _solved_in_torch(
