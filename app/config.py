@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from softtwin.meshes.attachment import parse_file
 from softtwin.meshes.io import SEGMENTATIONS, Axes
+from softtwin.reference.data.springs import Springs
 
 from .parameters import NamedParameter
 from .parameters import words as words_of_parameters
@@ -98,6 +99,39 @@ class BodySection(Section):
         basic=True,
         metavar="NAME[=FILE]",
     )
+
+
+class SpringsSection(Section):
+    """What holds the organ and gives way (ligaments, vessels, what it lies on), beside what body.fixed holds."""
+
+    where: dict[str, str] = option(
+        {}, "named parts of the surface: files or words as for fixed", flag="--springs", metavar="NAME=WHERE"
+    )
+    normal: dict[str, float] = option(
+        {}, "stiffness per area across the surface of each part", unit="N/m^3", metavar="NAME=STIFFNESS"
+    )
+    tangential: dict[str, float] = option(
+        {}, "stiffness per area along it; without one the organ slides there", unit="N/m^3", metavar="NAME=STIFFNESS"
+    )
+
+    @model_validator(mode="after")
+    def _belong_together(self) -> SpringsSection:
+        for word in ("normal", "tangential"):
+            strange = sorted(getattr(self, word).keys() - self.where.keys())
+            if strange:
+                raise ValueError(
+                    f"springs.{word}: expected names of springs.where, {sorted(self.where)}, got {strange[0]!r}"
+                )
+        taken = sorted(self.where.keys() & {"fixed", "observed", "boundary"})
+        if taken:
+            raise ValueError(f"springs.where: expected a name of its own, got {taken[0]!r}")
+        _ = self.by_name
+        return self
+
+    @property
+    def by_name(self) -> dict[str, Springs]:
+        """The springs of each part."""
+        return {name: Springs(self.normal.get(name, 0.0), self.tangential.get(name, 0.0)) for name in self.where}
 
 
 Law = Literal["neo-hookean", "saint-venant-kirchhoff", "isochoric-neo-hookean", "linear-elastic"]
@@ -480,6 +514,7 @@ class Config(Section):
 
     folder: str = option("twin-run", "folder of everything that is made, relative to this file")
     body: BodySection = part(BodySection)
+    springs: SpringsSection = part(SpringsSection)
     material: MaterialSection = part(MaterialSection)
     loads: LoadsSection = part(LoadsSection)
     samples: SamplesSection = part(SamplesSection)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ def plan_entries(config: Config) -> dict[str, Any]:
         del loads["sequence"]  # as in a data set's header
     if not samples.smooth:
         del loads["smoothness"]
+    springs = {name: asdict(each) for name, each in config.springs.by_name.items()}
     return {
         **{word: getattr(config.material, name) for name, word in _MATERIAL.items()},
         "loads": loads,
@@ -60,6 +62,7 @@ def plan_entries(config: Config) -> dict[str, Any]:
         "ramp": samples.load_path,
         "seed": samples.seed,
         "newton": config.solver.model_dump(),
+        **({"springs": springs} if springs else {}),
     }
 
 
@@ -68,6 +71,7 @@ def mesh_inputs(space: Workspace) -> dict[str, Any]:
     every = _flat("body", space.config.body.model_dump())
     read = {name: _content(value, space.root) for name, value in every if _LATER.get(name, ...) != value}
     source = parse_file(space.config.body.source)
+    read |= {f"springs.{name}": _content(value, space.root) for name, value in space.config.springs.where.items()}
     folder = space.root / source.path
     if folder.is_dir() and is_segmentation(folder):
         read["body.source"] = {path.name: f"sha256:{_sha256(path)}" for path in structure_files(folder)}
@@ -197,7 +201,9 @@ def check_material(twin: Path, config: Config) -> None:
     """
     try:
         learned = json.loads((twin / "surrogate.json").read_text())["data"]["plan"]
-        wrong = [
+        springs = {name: asdict(each) for name, each in config.springs.by_name.items()}
+        wrong = [] if learned.get("springs", {}) == springs else ["springs"]
+        wrong += [
             f"material.{name} ({learned[word]} learned, {getattr(config.material, name)} in organ.toml)"
             for name, word in _MATERIAL.items()
             if word in learned and learned[word] != getattr(config.material, name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -92,19 +93,20 @@ def make_body(section: BodySection, root: Path) -> Body:
     return make_organ(section, root).body
 
 
-def make_organ(section: BodySection, root: Path) -> Organ:
+def make_organ(section: BodySection, root: Path, springs: Mapping[str, str] = MappingProxyType({})) -> Organ:
     """The body that a configuration describes, and what was done to its surface.
 
     Args:
         section: the configuration's [body].
         root: folder that relative paths start from.
+        springs: where springs hold it, by name: a surface of the body each.
 
     Raises:
         RegionError, FileError, SurfaceError, BodyError, ConfigError: what is wrong with the input. What can be seen
             before a surface is made solid is said before.
     """
     check_component(section.component)
-    regions = _checked_regions(section, root)
+    regions = _checked_regions(section, root, springs)
     notes: list[str] = []
     scan = _scan(section, root, regions)
     if section.source in SHAPES:
@@ -128,10 +130,17 @@ def make_organ(section: BodySection, root: Path) -> Organ:
         zone: _nodes(body, f"body.zones.{zone}", regions[f"zones.{zone}"], section, reader) for zone in section.zones
     }
     body = body.with_sets(**zones)
+    for name in springs:
+        nodes = _nodes(body, f"springs.where.{name}", regions[f"springs.{name}"], section, reader)
+        body = replace(body, surfaces={**body.surfaces, name: _covered(body, f"springs.where.{name}", nodes)})
     if regions["observed"]:
         observed, said = _observed(body, regions["observed"], reader)
         body, notes = replace(body, surfaces={**body.surfaces, "observed": observed}), [*notes, *said]
     if section.grid > 0.0:
+        if springs:
+            raise ConfigError(
+                f"springs.where: expected none on a grid, whose cells do not end there, got {[*springs]}."
+            )
         body, line = _on_grid(body, section.grid)
         notes.append(line)
     return Organ(body, tuple(notes))
@@ -187,9 +196,9 @@ def _check_stated(section: BodySection, root: Path) -> None:
         )
 
 
-def _checked_regions(section: BodySection, root: Path) -> dict[str, tuple[Region, ...]]:
-    """The regions of attachment, zones and observed side, refused where they cannot be before a mesh is made."""
-    if section.source not in SHAPES and not section.fixed:
+def _checked_regions(section: BodySection, root: Path, springs: Mapping[str, str]) -> dict[str, tuple[Region, ...]]:
+    """The regions of attachment, springs, zones, observed side, refused where they cannot be before a mesh is made."""
+    if section.source not in SHAPES and not section.fixed and not springs:
         raise BodyError(
             "body.fixed: expected what holds the organ, got nothing; without it the organ has no equilibrium. Give "
             "--fixed FILE (points or triangles near the attachment, or .npy/.txt with node numbers), or say where it "
@@ -197,6 +206,7 @@ def _checked_regions(section: BodySection, root: Path) -> dict[str, tuple[Region
         )
     texts = {"fixed": section.fixed, "observed": section.observed}
     texts |= {f"zones.{name}": text for name, text in section.zones.items()}
+    texts |= {f"springs.{name}": text for name, text in springs.items()}
     regions = {name: parse_regions(text, section.unit, root) if text else () for name, text in texts.items()}
     if files_axes(section) == "ras":
         regions = {name: tuple(map(turned, group)) for name, group in regions.items()}
@@ -319,18 +329,23 @@ def _outside(body: Body, name: str, surface: Surface) -> list[str]:
 
 def _attached(body: Body, nodes: Ints) -> Ints:
     """The given nodes that belong to a boundary triangle given whole: an attachment is a surface, not a lone node."""
+    return np.unique(_covered(body, "body.fixed", nodes))
+
+
+def _covered(body: Body, name: str, nodes: Ints) -> Ints:
+    """The boundary triangles whose nodes are all given, (t, 3)."""
     whole = body.boundary[np.isin(body.boundary, nodes).all(axis=1)]
     if len(whole) == 0:
         raise BodyError(
-            f"body.fixed: expected fixed nodes that cover part of the surface, got {len(nodes)} nodes that span no "
+            f"{name}: expected nodes that cover part of the surface, got {len(nodes)} nodes that span no "
             "whole boundary triangle; enlarge the distance (--fixed-distance) or give more of the attachment."
         )
-    return np.unique(whole)
+    return whole
 
 
 def _nodes(body: Body, name: str, regions: Iterable[Region], section: BodySection, reader: _Reader) -> Ints:
     """Nodes of a union of regions, sorted."""
-    near = section.fixed_distance if name == "body.fixed" else 0.0
+    near = section.fixed_distance if name == "body.fixed" or name.startswith("springs.") else 0.0
     parts = [
         _nodes_of_file(body, name, region, near or median_edge(body), reader)
         if isinstance(region, File)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from softtwin.meshes.embedding import outer
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.metrics import nodal_volumes
 from softtwin.reference.data.loading import Loading
+from softtwin.reference.data.springs import Springs
 from softtwin.registration.contact import Patch
 from softtwin.registration.parameters.block import ParameterBlock
 from softtwin.registration.parameters.input_block import InputBlock
@@ -37,6 +39,7 @@ class Scenario:
         pressure: on the whole boundary, pascals.
         density: kg/m^3.
         scan_gravity: gravity under which the files show the organ, on their axes, (3,), m/s^2.
+        springs: that hold named surfaces.
         floats: what surrounds the organ carries its weight by a pressure that grows with depth; the pressure that is
             unknown is beside it.
     """
@@ -47,6 +50,7 @@ class Scenario:
     pressure: float
     density: float
     scan_gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    springs: Mapping[str, Springs] = field(default_factory=dict)
     floats: bool = False
 
     @classmethod
@@ -60,6 +64,7 @@ class Scenario:
             section.pressure,
             config.material.density,
             section.scan_gravity,
+            config.springs.by_name,
             section.forces == "normal",
         )
 
@@ -76,11 +81,10 @@ class Scenario:
         by_region = any(named.kind == "young-modulus" and named.place for named in self.parameters)
         return np.full(len(body.cells), modulus) if by_region else modulus
 
-    @property
-    def held(self) -> dict[str, str]:
-        """Axes that are held at each node set."""
+    def held(self, body: Body) -> dict[str, str]:
+        """Axes that are held at each node set of a body; springs may be all that holds it."""
         moved = [named.place for named in self.parameters if named.kind == "moved"]
-        return {"fixed": "xyz", **dict.fromkeys(moved, "xyz")}
+        return dict.fromkeys([*(["fixed"] if len(body.fixed) else []), *moved], "xyz")
 
     def loading(self, body: Body, coordinates: Coordinates) -> Loading:
         """What is known to act, that of the scan included.

@@ -85,7 +85,9 @@ class TorchBlocks:
             plan = plan_from_header(data.header)
             settings = NewtonSettings(plan.newton.tolerance, plan.newton.max_iterations, plan.newton.max_load_steps)
             try:
-                solver = Equilibria(data.body, plan.build_material(), self.device, settings=settings)
+                solver = Equilibria(
+                    data.body, plan.build_material(), self.device, settings=settings, springs=plan.springs
+                )
             except ValueError as error:
                 raise ConfigError(f"generate --engine torch: {error} Solve it with --engine reference.") from None
             self._solver = data, plan, solver
@@ -177,7 +179,7 @@ def agreement(data: DataSet, draws: list[int], share: float = CHECKED) -> dict[s
     rng = np.random.default_rng([plan.seed, 6])
     chosen = sorted(rng.choice(draws, max(1, int(np.ceil(share * len(draws)))), replace=False).tolist())
     differences, lost = [], []
-    with Problem(data.body, plan.build_material(), plan.newton) as problem:
+    with Problem(data.body, plan.build_material(), plan.newton, springs=plan.springs) as problem:
         for draw in chosen:
             rows = data.rows(range(draw, draw + 1))
             forces = np.zeros_like(data.body.points)

@@ -55,6 +55,7 @@ from .workspace import open_workspace
 
 if TYPE_CHECKING:
     from softtwin.reference.data.materials import Material
+    from softtwin.reference.data.springs import Springs
     from softtwin.reference.unloaded import Unloaded
     from softtwin.surrogate.equilibria_model import EquilibriaModel
     from softtwin.surrogate.error_bound import ErrorBound, ErrorEstimator
@@ -797,7 +798,8 @@ def forward_models(
     from softtwin.reference.data.materials import MATERIALS
 
     scenario = Scenario.of(config)
-    strange = sorted(scenario.held.keys() - body.node_sets.keys())
+    held = scenario.held(body)
+    strange = sorted(held.keys() - body.node_sets.keys())
     if strange:
         raise ConfigError(
             f"registration.parameters: expected moved@ one of {sorted(body.node_sets)}, got {strange[0]!r}."
@@ -812,7 +814,7 @@ def forward_models(
     modulus = scenario.modulus(config.material.young_modulus, body)
     material = MATERIALS[config.material.law](modulus, config.material.poisson_ratio)
     if name == "torch":
-        yield _solved_in_torch(body, material, loading.forces, further), None
+        yield _solved_in_torch(body, material, scenario.springs, loading.forces, further), None
         return
     from softtwin.reference.derivatives.model import ReferenceModel  # FEniCSx is needed here alone
     from softtwin.reference.derivatives.scanned import ScannedModel
@@ -820,7 +822,7 @@ def forward_models(
 
     options = NewtonOptions(tolerance=_TOLERANCE, max_iterations=_ITERATIONS)
     behind = _unloaded(scenario, body, material, coordinates_of(config)) if any(scenario.scan_gravity) else None
-    with Problem(behind.body if behind else body, material, options, held=scenario.held) as problem:
+    with Problem(behind.body if behind else body, material, options, held=held, springs=scenario.springs) as problem:
         model = ReferenceModel(problem, patient=False, loading=loading, predictor=fast, discrepancy=further)
         yield ScannedModel(body, model, behind.displacement) if behind else model, fast
 
@@ -833,8 +835,9 @@ def _unloaded(scenario: Scenario, body: Body, material: Material, coordinates: C
     """
     from softtwin.reference.unloaded import unloaded  # FEniCSx is needed here alone
 
+    load = scenario.loading_of_scan(coordinates)
     try:
-        found = unloaded(body, material, scenario.loading_of_scan(coordinates), held=scenario.held)
+        found = unloaded(body, material, load, held=scenario.held(body), springs=scenario.springs)
     except NotConverged as error:
         raise ConfigError(f"registration.scan_gravity: {error}") from None
     if not found.is_stable:
@@ -847,14 +850,19 @@ def _unloaded(scenario: Scenario, body: Body, material: Material, coordinates: C
 
 
 def _solved_in_torch(
-    body: Body, material: Material, known: ArrayLike | None, further: Discrepancy | None
+    body: Body,
+    material: Material,
+    springs: Mapping[str, Springs],
+    known: ArrayLike | None,
+    further: Discrepancy | None,
 ) -> EquilibriaModel:
     """Equilibria in torch, in double precision on the processor."""
     from softtwin.surrogate.equilibria import Equilibria, NewtonSettings  # torch is needed here alone
     from softtwin.surrogate.equilibria_model import EquilibriaModel
 
     settings = NewtonSettings(tolerance=_TOLERANCE, iterations=_ITERATIONS)
-    return EquilibriaModel(Equilibria(body, material, settings=settings), known, discrepancy=further, patient=False)
+    solver = Equilibria(body, material, settings=settings, springs=springs)
+    return EquilibriaModel(solver, known, discrepancy=further, patient=False)
 
 
 def _loaded(network: Surrogate, known: ArrayLike) -> LoadedSurrogate:

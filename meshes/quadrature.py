@@ -21,6 +21,8 @@ _CURVED_SIMPLEX = 4
 
 # Keast (1986): 14 points, exact to degree 4; barycentric coordinate that three corners share, weight times 6.
 _KEAST = ((0.1005267652252045, 0.0885898247429807), (0.3143728734931922, 0.1328387466855907))
+# Dunavant (1985): 6 points, exact to degree 4; barycentric coordinate that two corners share, weight times 6.
+_DUNAVANT = ((0.445948490915965, 0.670144769034033), (0.091576213509771, 0.329855230965967))
 _KEAST_MIDDLES = 2.0 / 105.0
 
 
@@ -40,7 +42,8 @@ def quadrature_degree(body: Body, mixed: bool = False) -> int:
 def quadrature(kind: Kind, degree: int) -> tuple[Floats, Floats]:
     """Points in the reference cell, (q, d), and weights, (q,), that integrate polynomials of a degree exactly.
 
-    Lines, quadrilaterals and hexahedra by Gauss and Legendre; tetrahedra by one point (degree 1), five (degree 3:
+    Lines, quadrilaterals and hexahedra by Gauss and Legendre; triangles by three points (degree 2) or six (degree 4:
+    Dunavant 1985); tetrahedra by one point (degree 1), five (degree 3:
     Zienkiewicz and Taylor 2000) or fourteen (degree 4: Keast 1986).
 
     Args:
@@ -54,6 +57,8 @@ def quadrature(kind: Kind, degree: int) -> tuple[Floats, Floats]:
         at, weight = np.polynomial.legendre.leggauss((degree + 2) // 2)
         grid = np.array(list(product(0.5 * (at + 1.0), repeat=kind.dimension)))
         return grid, np.prod(list(product(0.5 * weight, repeat=kind.dimension)), axis=1)
+    if kind.shape == "triangle" and degree <= 4:
+        return _triangle(degree)
     if kind.shape != "tetrahedron" or degree > 4:
         raise ValueError(f"quadrature: no rule of degree {degree} for a {kind.shape}.")
     if degree <= 1:
@@ -64,6 +69,13 @@ def quadrature(kind: Kind, degree: int) -> tuple[Floats, Floats]:
     middles = np.array([[0.5 * ((i in pair) and i > 0) for i in range(1, 4)] for pair in _PAIRS])
     points = np.vstack([middles, *(_alike(share) for share, _ in _KEAST)])
     return points, np.array([_KEAST_MIDDLES] * 6 + [w for _, w in _KEAST for _ in range(4)]) / 6.0
+
+
+def _triangle(degree: int) -> tuple[Floats, Floats]:
+    """Points and weights of a triangle, degree 4 at most."""
+    shares = ((1.0 / 6.0, 1.0),) if degree <= 2 else _DUNAVANT
+    points = [np.array([[a, a], [1.0 - 2.0 * a, a], [a, 1.0 - 2.0 * a]]) for a, _ in shares]
+    return np.vstack(points), np.repeat([weight / 6.0 for _, weight in shares], 3)
 
 
 _PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))

@@ -48,6 +48,7 @@ from .data.samplers import (
 )
 from .data.schema import Reason
 from .data.shard import Shard, at_work_on, refuse_shards_at_work
+from .data.springs import Springs, springs_of
 from .data.writing import create, drop_block, write_block
 from .farm import Task, quiet, share_out
 from .fem.fenicsx import MPI, PETSc, dolfinx
@@ -85,6 +86,7 @@ class Plan:
             times cheaper a draw than independent loads where these need many Newton iterations from rest.
         seed: seed of everything random.
         newton: options of the solver.
+        springs: that hold named surfaces of the body, beside its fixed nodes.
     """
 
     material: str = "neo-hookean"
@@ -96,6 +98,7 @@ class Plan:
     ramp: int = 1
     seed: int = 0
     newton: NewtonOptions = field(default_factory=NewtonOptions)
+    springs: Mapping[str, Springs] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.material not in MATERIALS:
@@ -125,7 +128,8 @@ def plan_from_header(header: Mapping[str, Any]) -> Plan:
     """The plan that a data set was made with."""
     stored = stored_plan(header)
     loads = {**stored["loads"], "zones": tuple(stored["loads"]["zones"]), "radius": tuple(stored["loads"]["radius"])}
-    return Plan(**{**stored, "loads": LoadPlan(**loads), "newton": NewtonOptions(**stored["newton"])})
+    newton = NewtonOptions(**stored["newton"])
+    return Plan(**{**stored, "loads": LoadPlan(**loads), "newton": newton, "springs": springs_of(stored)})
 
 
 class DamagedBlock(UserWarning):
@@ -212,7 +216,7 @@ def _prepare(
         return _unfinished(present, redo, shard)
     if redo:
         raise DataSetError(f"generate.redo: expected a data set with blocks {list(redo)} in {path}, found none.")
-    with Problem(body, plan.build_material(), plan.newton) as problem:
+    with Problem(body, plan.build_material(), plan.newton, springs=plan.springs) as problem:
         modes = eigenmodes(problem, plan.loads.modes)
         loaded = loaded_nodes(body, plan.loads)
         loads = None if _is_whole(loaded) else _pilots(body, modes.shapes, plan)[:, loaded]
@@ -267,6 +271,8 @@ def _plain(plan: Plan) -> dict[str, Any]:
         del description["loads"]["sequence"]  # data sets that are older than the choice do not name it
     if not plan.samples.get("smooth"):
         del description["loads"]["smoothness"]  # the same, and it would tell apart what is alike
+    if not plan.springs:
+        del description["springs"]
     return description
 
 
@@ -413,7 +419,7 @@ def _opened(path: str, made: int) -> tuple[DataSet, Plan, Problem]:
     """`made`, the time of the header, tells a data set that was made again in the same place."""
     data = DataSet(path)
     plan = plan_from_header(data.header)
-    return data, plan, Problem(data.body, plan.build_material(), plan.newton)
+    return data, plan, Problem(data.body, plan.build_material(), plan.newton, springs=plan.springs)
 
 
 def solve_block(path: str, block: int, predictor: Predictor | None = None) -> int:

@@ -215,7 +215,7 @@ def _difference(
         guess = known.copy()
         guess[body.fixed] = 0.0
     try:
-        with Problem(body, plan.build_material(), plan.newton) as problem:
+        with Problem(body, plan.build_material(), plan.newton, springs=plan.springs) as problem:
             found = problem.solve(forces, guess, stability=False).displacement
     except NotConverged:
         return None

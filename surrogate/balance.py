@@ -78,7 +78,9 @@ def balance(
     forces, found = predictions(surrogate, data, samples)
     body = data.body
     held = np.linalg.norm(found[:, body.fixed], axis=2)
-    inside_out, residuals, gaps = _measured(ElasticBody(body, data.material), forces, found, samples.displacements)
+    inside_out, residuals, gaps = _measured(
+        ElasticBody(body, data.material, springs=data.springs), forces, found, samples.displacements
+    )
     sound = np.flatnonzero(~inside_out)
     pivots = None if negative_pivots is None else [negative_pivots(_kept(found[i], body.fixed)) for i in sound]
     at_rest = surrogate.solve(np.zeros_like(body.points)).displacement

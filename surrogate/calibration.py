@@ -73,8 +73,12 @@ def calibrate(
     learned, plan = surrogate.learned_material or {}, data.header.get("plan", {})
     wrong = [f"{name} ({value} learned, {plan[name]} there)" for name, value in learned.items()
              if name in plan and plan[name] != value]  # fmt: skip
+    if surrogate.learned_springs != data.springs:
+        wrong.append(f"springs ({surrogate.learned_springs} learned, {data.springs} there)")
     if wrong:
-        raise CalibrationError(f"calibrate.data: {data.path} is of another material than the surrogate: {wrong[0]}.")
+        raise CalibrationError(
+            f"calibrate.data: {data.path} is of another material or support than the surrogate: {wrong[0]}."
+        )
     held, fitted = data.samples(split), data.samples(fitted_on)
     paths = data.load_paths(split, held.draws)
     if len(np.unique(paths)) < needed(confidence) or len(fitted) == 0:

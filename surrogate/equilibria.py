@@ -8,8 +8,10 @@ solver in torch DiffEn).
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -19,6 +21,7 @@ from torch import Tensor
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.materials import Material, Parameter, with_parameters
+from softtwin.reference.data.springs import Springs
 
 from .residual import ElasticBody
 from .tangents import Factors, LayeredMatrices, layers_of
@@ -109,6 +112,7 @@ class Equilibria:
         device: `cpu`, `cuda`, or a torch device.
         precision: `double`, or `single` where a tolerance of about 1e-5 is enough.
         settings: of Newton's method.
+        springs: that hold named surfaces, beside the body's fixed nodes.
 
     Raises:
         ValueError: a material or a body that `ElasticBody` does not know, a body that nothing holds, or one too large
@@ -122,6 +126,7 @@ class Equilibria:
         device: str | torch.device = "cpu",
         precision: str = "double",
         settings: NewtonSettings | None = None,
+        springs: Mapping[str, Springs] = MappingProxyType({}),
     ) -> None:
         if precision not in ("double", "single"):
             raise ValueError(f"Equilibria.precision: expected 'double' or 'single', got {precision!r}.")
@@ -129,7 +134,7 @@ class Equilibria:
             raise ValueError(
                 f"Equilibria.device: expected a GPU that torch can use, found none (torch {torch.__version__})."
             )
-        self.elastic = ElasticBody(body, material).to(device, getattr(torch, _TYPES[precision]))
+        self.elastic = ElasticBody(body, material, springs=springs).to(device, getattr(torch, _TYPES[precision]))
         self.dtype, self.device = self.elastic.gradients.dtype, self.elastic.gradients.device
         self.body, self.material, self.settings = body, material, settings or NewtonSettings()
         is_free = self.elastic.free[:, 0].cpu().numpy() > 0.0
@@ -140,7 +145,7 @@ class Equilibria:
         self._free = torch.from_numpy(free).to(self.device)
         of_cells = torch.from_numpy(numbers).to(self.device)[self.elastic.cells].flatten(1)
         self._matrices = LayeredMatrices(of_cells, np.repeat(layers[free], 3))
-        self._warping = None if material.is_linear else Warping(self.elastic, layers)
+        self._warping = None if material.is_linear else Warping(self.elastic, layers, body.size)
         self._stiffen()
 
     def _stiffen(self) -> None:

@@ -117,7 +117,7 @@ class IndicatorReader:
             )
         material = MATERIALS[learned["material"]](learned["young_modulus"], learned["poisson_ratio"])
         self.surrogate = surrogate
-        self._elastic = ElasticBody(surrogate.body, material)
+        self._elastic = ElasticBody(surrogate.body, material, springs=surrogate.learned_springs)
         free = np.ones(surrogate.body.points.shape, dtype=bool)
         free[surrogate.body.fixed] = False
         self._free = free.ravel()

@@ -143,6 +143,11 @@ def _check_material(surrogate: Surrogate, data: DataSet) -> None:
         raise ValueError(
             f"evaluate.data: expected the material that the surrogate has learned ({there}), got {here} in {data.path}."
         )
+    if surrogate.learned_springs != data.springs:
+        raise ValueError(
+            f"evaluate.data: expected the springs that the surrogate has learned ({surrogate.learned_springs}), "
+            f"got {data.springs} in {data.path}."
+        )
 
 
 def _predict(surrogate: Surrogate, data: DataSet, samples: Samples) -> tuple[Floats, Floats, Floats]:

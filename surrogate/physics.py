@@ -68,7 +68,9 @@ class PhysicsObjective(nn.Module):
     def __init__(self, objective: Any, data: DataSet, physics: Physics) -> None:
         super().__init__()
         self.objective, self.physics = objective, physics
-        self.body = ElasticBody(data.body, data.material, minimum_jacobian=_LEAST_JACOBIAN).float()
+        self.body = ElasticBody(
+            data.body, data.material, springs=data.springs, minimum_jacobian=_LEAST_JACOBIAN
+        ).float()
         samples = objective.fields(torch.arange(min(objective.sample_count, 256)))[1]
         loaded = data.response.loaded
         linear = data.response.apply(samples[:, loaded].double().numpy())

@@ -147,7 +147,9 @@ def basis_of(data: DataSet, modes: Floats, symmetric: bool) -> ReducedBasis:
 
 def group_of(data: DataSet, symmetric: bool) -> tuple[Symmetry, ...]:
     """The symmetries of a data set's body, or the identity alone."""
-    return symmetries(data.body, data.response.loaded) if symmetric else (identity(data.body),)
+    if not symmetric:
+        return (identity(data.body),)
+    return symmetries(data.body, data.response.loaded, springs=data.springs)
 
 
 def _turns(modes: Floats, body: Body, group: Sequence[Symmetry]) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.elements import linear_kind
 from softtwin.meshes.quadrature import quadrature, quadrature_degree, shape_functions
 from softtwin.reference.data.materials import Energy, Material
+from softtwin.reference.data.springs import Springs, cell_springs
 
 from .algebra import TorchAlgebra
 
@@ -31,6 +32,7 @@ class ElasticBody(nn.Module):
         body: the body, in space.
         material: strain energy; not mixed, and not an own `Energy`, which is written in UFL.
         weights: factor of each cell's energy, (cells,), in place of the body's own fractions.
+        springs: that hold named surfaces; their energy, forces and stiffness count with the cells' own.
         minimum_jacobian: for training: det F below it counts more (`TorchAlgebra`), and nothing is NaN; 0 leaves all
             as it is.
 
@@ -42,9 +44,18 @@ class ElasticBody(nn.Module):
     volumes: Tensor
     cells: Tensor
     free: Tensor
+    sprung: Tensor
+    spring_stiffness: Tensor
+    spring_areas: Tensor
 
     def __init__(
-        self, body: Body, material: Material, weights: ArrayLike | None = None, *, minimum_jacobian: float = 0.0
+        self,
+        body: Body,
+        material: Material,
+        weights: ArrayLike | None = None,
+        *,
+        springs: Mapping[str, Springs] = MappingProxyType({}),
+        minimum_jacobian: float = 0.0,
     ) -> None:
         super().__init__()
         if body.dimension != 3:
@@ -70,6 +81,10 @@ class ElasticBody(nn.Module):
         is_free = np.ones((self.nodes, 1))
         is_free[body.fixed] = 0.0
         self.register_buffer("free", torch.from_numpy(is_free))
+        held = cell_springs(body, springs)
+        self.register_buffer("sprung", torch.from_numpy(held.cells))
+        self.register_buffer("spring_stiffness", torch.from_numpy(held.stiffness))
+        self.register_buffer("spring_areas", torch.from_numpy(held.areas))
         for name, values in self._named(material).items():
             self.register_buffer(name, values)
 
@@ -126,21 +141,38 @@ class ElasticBody(nn.Module):
         return TorchAlgebra(F).det(F)
 
     def energy(self, displacement: Tensor) -> Tensor:
-        """Strain energy, (s,), joules; NaN where the law is none for a cell inside out."""
+        """Strain energy, and that of springs, (s,), joules; NaN where the law is none for a cell inside out."""
         F = self.deformation_gradients(displacement)
-        return (self.density(F) * self.volumes).sum(dim=(1, 2))
+        stored = (self.density(F) * self.volumes).sum(dim=(1, 2))
+        return stored + self._spring_energy(displacement) if len(self.sprung) else stored
+
+    def _pulled(self, displacement: Tensor) -> tuple[Tensor, Tensor]:
+        """Displacements of the cells that springs hold, and what these need for it, (s, c, 3k) each."""
+        moved = displacement[:, self.cells[self.sprung]].flatten(2)
+        return moved, torch.einsum("cij,scj->sci", self.spring_stiffness, moved)
+
+    def _spring_energy(self, displacement: Tensor) -> Tensor:
+        moved, pulled = self._pulled(displacement)
+        return 0.5 * (moved * pulled).sum(dim=(1, 2))
+
+    def _with_spring_forces(self, forces: Tensor, displacement: Tensor) -> Tensor:
+        if not len(self.sprung):
+            return forces
+        cells = self.cells[self.sprung]
+        pulled = self._pulled(displacement)[1].reshape(len(forces), cells.numel(), 3)
+        return forces.index_add(1, cells.reshape(-1), pulled)
 
     def internal_forces(self, displacement: Tensor) -> Tensor:
-        """Derivative of the strain energy, (s, n, 3), newtons; itself differentiable."""
+        """Derivative of the stored energy, (s, n, 3), newtons; itself differentiable."""
         F = self.deformation_gradients(displacement)
         is_differentiated = F.requires_grad
         with torch.enable_grad():
             at = F if is_differentiated else F.requires_grad_()
             (stress,) = torch.autograd.grad(self.density(at).sum(), at, create_graph=is_differentiated)
-        return self.assembled(stress)
+        return self._with_spring_forces(self.assembled(stress), displacement)
 
     def energy_and_forces(self, displacement: Tensor) -> tuple[Tensor, Tensor]:
-        """Strain energy, (s,), joules, and its derivative, (s, n, 3), newtons, of states that carry no derivatives.
+        """Stored energy, (s,), joules, and its derivative, (s, n, 3), newtons, of states that carry no derivatives.
 
         Where a cell is inside out, the energy is infinite.
         """
@@ -152,7 +184,9 @@ class ElasticBody(nn.Module):
         density = density.detach()
         is_sound = (TorchAlgebra(F).det(F.detach()) > 0.0) | self.material.is_linear
         energy = torch.where(is_sound, density * self.volumes, torch.inf).sum(dim=(1, 2))
-        return energy, self.assembled(stress)
+        if len(self.sprung):
+            energy = energy + self._spring_energy(displacement).detach()
+        return energy, self._with_spring_forces(self.assembled(stress), displacement.detach())
 
     def assembled(self, stress: Tensor) -> Tensor:
         """Nodal forces, (s, n, 3), newtons, of stresses P at the points of the quadrature, (s, cells, q, 3, 3)."""
@@ -169,7 +203,10 @@ class ElasticBody(nn.Module):
         cells, _, nodes, _ = self.gradients.shape
         ahead = torch.einsum("scqijml,cqnl->scqjinm", moduli, self.gradients).reshape(len(F), cells, -1, 9 * nodes)
         behind = self.gradients.transpose(1, 2).reshape(cells, nodes, -1)
-        return (behind @ ahead).reshape(len(F), cells, 3 * nodes, 3 * nodes)
+        found = (behind @ ahead).reshape(len(F), cells, 3 * nodes, 3 * nodes)
+        if len(self.sprung):
+            found = found.index_add(1, self.sprung, self.spring_stiffness.expand(len(F), -1, -1, -1))
+        return found
 
     def moduli(self, F: Tensor) -> Tensor:
         """Second derivatives of the energy density by F, pascals: (..., 3, 3, 3, 3) for (..., 3, 3)."""
@@ -217,6 +254,7 @@ class ElasticBody(nn.Module):
         return density
 
     def energy_of(self, displacement: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Strain energy of all states together, joules, as a function of displacements and parameters."""
+        """Stored energy of all states together, joules, as a function of displacements and parameters."""
         F = self.deformation_gradients(displacement)
-        return (self.density_of(F, parameters) * self.volumes).sum()
+        stored = (self.density_of(F, parameters) * self.volumes).sum()
+        return stored + self._spring_energy(displacement).sum() if len(self.sprung) else stored

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,7 @@ def identity(body: Body) -> Symmetry:
     return Symmetry(np.arange(len(body.points)), np.eye(3))
 
 
-def symmetries(body: Body, loaded: Ints, tolerance: float = 1e-6) -> tuple[Symmetry, ...]:
+def symmetries(body: Body, loaded: Ints, tolerance: float = 1e-6, springs: Iterable[str] = ()) -> tuple[Symmetry, ...]:
     """The symmetries of a discrete body of isotropic material among axis swaps and mirrors; the identity comes first.
 
     Axes are those of the coordinates or, where these show none, the principal axes of the nodes. Nodes must land on
@@ -51,9 +52,11 @@ def symmetries(body: Body, loaded: Ints, tolerance: float = 1e-6) -> tuple[Symme
         body: the body.
         loaded: numbers of the nodes that may carry force, (l,).
         tolerance: largest distance between a moved node and its partner, relative to the body's size.
+        springs: names of surfaces that springs hold: each must land on itself.
     """
     centred = body.points - body.points.mean(axis=0)
     tree = cKDTree(centred)
+    held = [body.boundary if name == "boundary" else body.surfaces[name] for name in springs]
     for axes in (np.eye(3), np.linalg.eigh(centred.T @ centred)[1]):
         found = [identity(body)]
         for order, indicators in itertools.product(
@@ -62,14 +65,14 @@ def symmetries(body: Body, loaded: Ints, tolerance: float = 1e-6) -> tuple[Symme
             rotation = axes @ (np.array(indicators)[:, None] * np.eye(3)[list(order)]) @ axes.T
             distance, nodes = tree.query(centred @ rotation.T)
             moved = not np.allclose(rotation, np.eye(3))
-            if moved and distance.max() < tolerance * body.size and _maps(body, loaded, nodes):
+            if moved and distance.max() < tolerance * body.size and _maps(body, loaded, held, nodes):
                 found.append(Symmetry(nodes, rotation))
         if len(found) > 1:
             return tuple(found)
     return (identity(body),)
 
 
-def _maps(body: Body, loaded: Ints, nodes: Ints) -> bool:
+def _maps(body: Body, loaded: Ints, held: Sequence[Ints], nodes: Ints) -> bool:
     cells = np.sort(body.cells, axis=1)
     images = np.sort(nodes[body.cells], axis=1)
     filled = np.ones(len(cells)) if body.fractions is None else body.fractions
@@ -77,6 +80,7 @@ def _maps(body: Body, loaded: Ints, nodes: Ints) -> bool:
         len(np.unique(nodes)) == len(nodes)
         and np.array_equal(np.sort(nodes[body.fixed]), body.fixed)
         and np.array_equal(np.sort(nodes[loaded]), np.sort(loaded))
+        and all(np.array_equal(np.unique(part), np.unique(nodes[part])) for part in held)
         and np.array_equal(np.unique(cells, axis=0), np.unique(images, axis=0))
         and np.allclose(filled[np.lexsort(cells.T)], filled[np.lexsort(images.T)], rtol=0.0, atol=_AS_FULL)
     )

@@ -19,7 +19,7 @@ def mesh_stage(space: Workspace) -> Body:
     """
     space.folder.mkdir(parents=True, exist_ok=True)
     with timed(space, "mesh", mesh_inputs(space)):
-        organ = make_organ(space.config.body, space.root)
+        organ = make_organ(space.config.body, space.root, space.config.springs.where)
         write_body(space.body, organ.body)
         lines = [str(mesh_quality(organ.body)), *organ.notes]
         write_whole(space.folder / "mesh_quality.txt", "\n".join(lines) + "\n")

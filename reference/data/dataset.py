@@ -20,6 +20,7 @@ from softtwin.meshes.embedding import outer
 from . import schema
 from .materials import MATERIALS, Material
 from .schema import Reason
+from .springs import Springs, springs_of
 from .store import StoreError, is_tensors, open_store
 
 Floats = NDArray[np.float64]
@@ -177,6 +178,11 @@ class DataSet:
             return MATERIALS[plan["material"]](plan["young_modulus"], plan["poisson_ratio"])
         except KeyError as error:
             raise DataSetError(f"DataSet: expected a known material in the header of {self.path}, got none.") from error
+
+    @property
+    def springs(self) -> dict[str, Springs]:
+        """That hold the body beside its fixed nodes, by the surface that they hold."""
+        return springs_of(self.header.get("plan", {}))
 
     @property
     def identity(self) -> str:

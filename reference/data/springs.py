@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.elements import KINDS
+from softtwin.meshes.quadrature import quadrature, quadrature_degree, shape_functions
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,11 @@ class Springs:
             raise ValueError("Springs: expected a stiffness above 0 N/m^3 across or along the surface, got none.")
 
 
+def springs_of(plan: Mapping[str, Any]) -> dict[str, Springs]:
+    """The springs in the plan of a data set or of a twin's card, by the surface that they hold."""
+    return {name: Springs(**each) for name, each in plan.get("springs", {}).items()}
+
+
 def checked_springs(springs: Mapping[str, Springs], body: Body) -> dict[str, Springs]:
     """Springs by the surface that they hold.
 
@@ -48,3 +59,63 @@ def checked_springs(springs: Mapping[str, Springs], body: Body) -> dict[str, Spr
         if name not in known:
             raise ValueError(f"Problem.springs: expected a surface among {known}, got {name!r}.")
     return dict(springs)
+
+
+@dataclass(frozen=True, eq=False)
+class CellSprings:
+    """Springs as matrices of the cells that they hold: what a solver without facets adds to its cells.
+
+    Args:
+        cells: numbers of these cells, (c,).
+        stiffness: of each, node by node, (c, 3k, 3k), N/m.
+        areas: integral of products of shape functions over the part that is held, (c, k, k), m^2.
+    """
+
+    cells: NDArray[np.int64]
+    stiffness: Floats
+    areas: Floats
+
+
+def cell_springs(body: Body, springs: Mapping[str, Springs]) -> CellSprings:
+    """The matrices of springs, with the quadrature of the reference.
+
+    Args:
+        body: the body, in space.
+        springs: by the surface that they hold, which ends on its cells.
+
+    Raises:
+        ValueError: a surface that the body does not have.
+    """
+    kind = body.kind
+    local = np.array(kind.facets)
+    owners = {
+        tuple(sorted(corners)): (cell, place)
+        for cell, facets in enumerate(body.cells[:, local].tolist())
+        for place, corners in enumerate(facets)
+    }
+    facet_kind = KINDS[2, local.shape[1]]
+    degree = max(quadrature_degree(body), 2 * kind.degree)
+    points, weights = quadrature(facet_kind, degree)
+    values, slopes = shape_functions(facet_kind, points)
+    found: dict[int, tuple[Floats, Floats]] = {}
+    for name, each in checked_springs(springs, body).items():
+        for facet in (body.facets if name == "boundary" else body.facets_of(name)).tolist():
+            cell, place = owners[tuple(sorted(facet))]
+            nodes = local[place]
+            areas = np.einsum("qkd,ki->qid", slopes, body.points[body.cells[cell, nodes]])
+            normals = np.cross(areas[:, :, 0], areas[:, :, 1])
+            sizes = np.linalg.norm(normals, axis=1)
+            normals /= sizes[:, None]
+            across = np.einsum("qi,qj->qij", normals, normals)
+            per_area = each.normal * across + each.tangential * (np.eye(3) - across)
+            products = np.einsum("q,qa,qb->qab", weights * sizes, values, values)
+            stiffness, area = found.setdefault(cell, (np.zeros((kind.nodes, 3) * 2), np.zeros((kind.nodes,) * 2)))
+            stiffness[np.ix_(nodes, range(3), nodes, range(3))] += np.einsum("qab,qij->aibj", products, per_area)
+            area[np.ix_(nodes, nodes)] += products.sum(axis=0)
+    cells = np.array(sorted(found), dtype=np.int64)
+    shape = (len(cells), 3 * kind.nodes, 3 * kind.nodes)
+    return CellSprings(
+        cells,
+        np.array([found[cell][0] for cell in cells]).reshape(shape),
+        np.array([found[cell][1] for cell in cells]).reshape(len(cells), kind.nodes, kind.nodes),
+    )

@@ -97,7 +97,9 @@ def test_a_cloud_of_it_is_registered(problem: Problem, scanned: Body, folder: Pa
     assert (errors < margin).mean() > 0.9
     missed = found.net_force - forces.sum(axis=0)
     assert missed @ np.linalg.solve(found.net_force_covariance, missed) < chi2.ppf(0.999, 3)
-    assert np.sqrt(np.trace(found.net_force_covariance)) < 0.1 * DENSITY * GRAVITY * free.volume  # which is no part of it
+    assert (
+        np.sqrt(np.trace(found.net_force_covariance)) < 0.1 * DENSITY * GRAVITY * free.volume
+    )  # which is no part of it
 
 
 def test_an_organ_that_could_not_hang_so_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,103 @@
+"""Springs in torch: matrices of cells that are the reference's, equilibria with nothing else that holds, symmetries."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+
+from softtwin.meshes.body import Body
+from softtwin.meshes.shapes import beam
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.data.springs import Springs, cell_springs
+from softtwin.reference.solve.problem import NewtonOptions, Problem
+from softtwin.surrogate.equilibria import Equilibria
+from softtwin.surrogate.residual import ElasticBody
+from softtwin.surrogate.symmetry import symmetries
+
+pytestmark = pytest.mark.fenicsx
+SPRINGS = {"start": Springs(4e4, 1e4), "side": Springs(tangential=2e3)}
+MATERIAL = NeoHookean(3000.0, 0.4)
+Cell = Literal["tetrahedron", "hexahedron"]
+
+
+def bar(cell: Cell, quadratic: bool = False, curved: bool = False) -> Body:
+    """A bar that nothing holds but springs; curved cells have their middles moved."""
+    made = beam((4, 2, 2), (0.3, 0.1, 0.1), cell)
+    made = made.quadratic() if quadratic else made
+    at = made.points[made.boundary]
+    surfaces = {
+        "start": made.boundary[np.isclose(at[..., 0], 0.0).all(axis=1)],
+        "side": made.boundary[np.isclose(at[..., 2], made.points[:, 2].min()).all(axis=1)],
+    }
+    points = made.points + (0.004 * np.sin(60.0 * made.points[:, ::-1]) if curved else 0.0)
+    return Body(points, made.cells, {}, surfaces)
+
+
+def forces_on(body: Body) -> np.ndarray:
+    forces = np.zeros_like(body.points)
+    end = np.isclose(body.points[:, 0], body.points[:, 0].max(), atol=0.01)
+    forces[end] = np.array([0.02, 0.05, -0.1]) / end.sum()
+    return forces
+
+
+@pytest.mark.parametrize(
+    ("cell", "quadratic", "curved"),
+    [
+        ("tetrahedron", False, False),
+        ("hexahedron", False, False),
+        ("hexahedron", False, True),
+        ("tetrahedron", True, False),
+        ("hexahedron", True, True),
+    ],
+)
+def test_energy_forces_and_stiffness_are_the_references(cell: Cell, quadratic: bool, curved: bool) -> None:
+    body, rng = bar(cell, quadratic, curved), np.random.default_rng(0)
+    displacement = 1e-3 * rng.standard_normal(body.points.shape)
+    with Problem(body, MATERIAL, springs=SPRINGS) as problem:
+        wanted = problem.stiffness(displacement)
+    elastic = ElasticBody(body, MATERIAL, springs=SPRINGS)
+    state = torch.from_numpy(displacement)
+    found = elastic.stiffness(state)
+    assert abs(found - wanted).max() < 1e-9 * abs(wanted).max()
+    energy, forces = elastic.energy_and_forces(state[None])
+    np.testing.assert_allclose(energy, elastic.energy(state[None]))
+    np.testing.assert_allclose(forces, elastic.internal_forces(state[None]))
+    at = state[None].clone().requires_grad_()
+    (slope,) = torch.autograd.grad(elastic.energy(at).sum(), at)
+    np.testing.assert_allclose(forces, slope, atol=1e-10 * float(forces.abs().max()))
+
+
+@pytest.mark.parametrize("cell", ["tetrahedron", "hexahedron"])
+def test_equilibria_are_the_references(cell: Cell) -> None:
+    body = bar(cell)
+    forces = forces_on(body)
+    with Problem(body, MATERIAL, NewtonOptions(tolerance=1e-12), springs=SPRINGS) as problem:
+        state = problem.solve(forces)
+        change = problem.apply_inverse(forces.reshape(-1, 1), state).reshape(-1, 3)
+    solver = Equilibria(body, MATERIAL, springs=SPRINGS)
+    found = solver.solve(forces[None])
+    assert bool(found.is_converged[0])
+    size = np.abs(state.displacement).max()
+    assert size > 0.02
+    np.testing.assert_allclose(found.displacement[0], state.displacement, atol=1e-8 * size)
+    pushed = solver.tangent(found.displacement).inverse(forces[None, :, :, None])[0, :, :, 0]
+    np.testing.assert_allclose(pushed, change, atol=1e-7 * np.abs(change).max())
+
+
+def test_a_body_that_floats_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected a body that something holds"):
+        Equilibria(bar("tetrahedron"), MATERIAL)
+    with pytest.raises(ValueError, match="got 'roof'"):
+        cell_springs(bar("tetrahedron"), {"roof": Springs(1.0)})
+
+
+def test_a_symmetry_moves_no_spring() -> None:
+    body = bar("hexahedron")
+    loaded = np.arange(len(body.points))
+    free, held = symmetries(body, loaded), symmetries(body, loaded, springs=["start", "side"])
+    assert len(free) > len(held) == 2  # what swaps ends, or top and bottom, is none any more
