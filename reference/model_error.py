@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
@@ -120,7 +121,7 @@ def differences(
                 raise ValueError(f"differences.count: expected at least 1, got {count}.")
             data = DataSet(path)
             data.check_complete("train")
-            if ensemble.attachment or ensemble.meshes:
+            if (ensemble.attachment or ensemble.meshes) and not data.springs:
                 shifted(data.body, np.zeros(3))
             if ensemble.meshes and data.body.cells.shape[1] != 4:
                 raise ValueError(
@@ -201,13 +202,13 @@ def _difference(
         body, carrier = others[int(rng.integers(len(others)))]
         forces = np.asarray(carrier.matrix.T @ forces)
     if ensemble.attachment or carrier is not None:
-        held = shifted(data.body, translation, body)
-        if len(held) < _LEAST_HELD:
+        moved = _supported(data, translation, body)
+        if moved is None:
             return None
-        if carrier is None and ensemble.poisson_ratio is None and np.array_equal(held, body.fixed):
+        if carrier is None and ensemble.poisson_ratio is None and _is_supported_alike(moved, body, plan.springs):
             return np.zeros(body.points.size)
-        body = body.with_sets(fixed=held)
-        forces[held] = 0.0
+        body = moved
+        forces[body.fixed] = 0.0
     if ensemble.poisson_ratio is not None:
         plan = replace(plan, poisson_ratio=float(rng.uniform(*ensemble.poisson_ratio)))
     guess = None  # the model's own state is near: it halves the time, and the equilibrium is the same to 1e-10
@@ -224,7 +225,30 @@ def _difference(
     return None if np.linalg.norm(off, axis=1).max() > _TOO_FAR * size else np.asarray(off.ravel() / size)
 
 
-def shifted(body: Body, translation: Floats, other: Body | None = None) -> Ints:
+def _supported(data: DataSet, translation: Floats, body: Body) -> Body | None:
+    """A mesh with what holds the organ elsewhere, fixed nodes and springs; None where too little of it is left."""
+    model = data.body
+    if len(model.fixed):
+        held = shifted(model, translation, body)
+        if len(held) < _LEAST_HELD:
+            return None
+        body = body.with_sets(fixed=held)
+    surfaces = dict(body.surfaces)
+    for name in data.springs.keys() - {"boundary"}:
+        nodes = shifted(model, translation, body, np.unique(model.surfaces[name]))
+        surfaces[name] = body.boundary[np.isin(body.boundary, nodes).all(axis=1)]
+        if not len(surfaces[name]):
+            return None
+    return replace(body, surfaces=surfaces)
+
+
+def _is_supported_alike(body: Body, other: Body, springs: Iterable[str]) -> bool:
+    """Whether two supports of one mesh are the same."""
+    surfaces = (np.array_equal(body.surfaces[name], other.surfaces[name]) for name in springs if name != "boundary")
+    return np.array_equal(body.fixed, other.fixed) and all(surfaces)
+
+
+def shifted(body: Body, translation: Floats, other: Body | None = None, nodes: Ints | None = None) -> Ints:
     """The nodes that hold a body, moved along its surface: numbers of the nodes that are held then.
 
     A node of the boundary is held where the one nearest to the place that it would come from is.
@@ -233,12 +257,13 @@ def shifted(body: Body, translation: Floats, other: Body | None = None) -> Ints:
         body: with fixed nodes.
         translation: (3,), metres.
         other: another mesh of the same organ, whose nodes are wanted; the body itself if not given.
+        nodes: that are moved, in place of the fixed ones.
 
     Raises:
         ValueError: none is fixed on the boundary.
     """
     boundary = body.boundary_nodes
-    is_held = np.isin(boundary, body.fixed)
+    is_held = np.isin(boundary, body.fixed if nodes is None else nodes)
     if not is_held.any():
         raise ValueError("shifted.body: expected fixed nodes on the boundary, got none.")
     wanted = body if other is None else other

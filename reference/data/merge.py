@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .dataset import NEEDED, SPLITS, DataSet, DataSetError, Split, stored_plan
 from .writing import create, write_block
 
-_SAME = ("material", "young_modulus", "poisson_ratio")
+_SAME = ("material", "young_modulus", "poisson_ratio", "springs")
 
 
 def merge(sources: Sequence[DataSet], path: Path | str) -> DataSet:
@@ -94,7 +94,7 @@ def _check(sources: Sequence[DataSet], path: Path) -> None:
         wrong = [f"{name} ({plans[0].get(name)}, {plans[1].get(name)})" for name in _SAME
                  if plans[0].get(name) != plans[1].get(name)]  # fmt: skip
         if wrong:
-            raise DataSetError(f"merge.sources: expected one material, got {where}: {'; '.join(wrong)}.")
+            raise DataSetError(f"merge.sources: expected one material and support, got {where}: {'; '.join(wrong)}.")
         ramps = [plan.get("ramp", 1) for plan in plans]
         if ramps[0] != ramps[1]:
             raise DataSetError(

@@ -245,7 +245,9 @@ class FieldBlock(ParameterBlock):
 
     def moved(self, at: Evaluation, change: Floats, every: int) -> Floats:
         """See `ParameterBlock.moved`."""
-        found: Floats = self.observed_modes.reshape(-1, 3, self.size)[::every] @ (self.amplitude * change)
+        found: Floats = self.observed_modes.reshape(len(self.observed_modes) // 3, 3, self.size)[::every] @ (
+            self.amplitude * change
+        )
         return found
 
     def full_columns(self, at: Evaluation, coefficients: Floats) -> Floats:

@@ -230,8 +230,11 @@ def test_sets_with_other_numbers_of_draws_a_path_are_refused(tmp_path: Path, ord
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"young_modulus": 4000.0}, r"expected one material, got .*young_modulus \(5000\.0, 4000\.0\)"),
-        ({"material": "linear-elastic"}, r"expected one material, got .*material \(neo-hookean, linear-elastic\)"),
+        ({"young_modulus": 4000.0}, r"expected one material and support, got .*young_modulus \(5000\.0, 4000\.0\)"),
+        (
+            {"material": "linear-elastic"},
+            r"expected one material and support, got .*material \(neo-hookean, linear-elastic\)",
+        ),
         ({"loads": LoadPlan(modes=3, displacement=0.1)}, r"expected gradients for the same modes"),
     ],
 )

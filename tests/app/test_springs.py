@@ -1,0 +1,159 @@
+"""A bar that lies on springs alone: from its configuration to registrations by all engines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("petsc4py", reason="FEniCSx is absent")
+pytest.importorskip("torch", reason="torch is absent")
+
+from softtwin.app.chain import build_twin
+from softtwin.app.config import Config, ConfigError, parse_config, read_config, to_toml
+from softtwin.app.inputs import mesh_inputs
+from softtwin.app.stages.mesh import mesh_stage
+from softtwin.app.twin import Twin
+from softtwin.app.workspace import Workspace
+from softtwin.meshes.body import Body, BodyError
+from softtwin.meshes.clouds import partial_view
+from softtwin.meshes.io import write_body
+from softtwin.meshes.shapes import beam
+from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.materials import NeoHookean
+from softtwin.reference.data.springs import Springs
+from softtwin.reference.solve.problem import Problem
+
+pytestmark = pytest.mark.fenicsx
+BED = Springs(normal=6e4, tangential=2e4)
+ENTRIES: dict[str, Any] = {
+    "folder": ".",
+    "body": {"source": "bar.vtu", "zones": {"tool": "box:0.3,-1,-1:1,1,1"}},
+    "springs": {
+        "where": {"bed": "halfspace:0,0,1e-6:0,0,-1"},
+        "normal": {"bed": BED.normal},
+        "tangential": {"bed": BED.tangential},
+    },
+    "loads": {"modes": 4, "displacement": 0.03},
+    "samples": {"train": 48, "validation": 4, "test": 8, "block": 4, "ranks": 1},
+    "training": {"modes": 16, "width": 32, "seconds": 5.0},
+}
+
+
+def config(**sections: Any) -> Config:
+    return Config.model_validate({**ENTRIES, **sections})
+
+
+def bar() -> Body:
+    made = beam((6, 2, 2), (0.4, 0.1, 0.1), "tetrahedron")
+    low = made.points - made.points.min(axis=0)
+    return Body(low, made.cells, {})
+
+
+def workspace(folder: Path, **sections: Any) -> Workspace:
+    write_body(folder / "bar.vtu", bar())
+    return Workspace(config(**sections), folder)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("springs")
+    workspace(folder)
+    build_twin(config(), folder, lambda _: None)
+    return folder
+
+
+def test_the_configuration_keeps_them(tmp_path: Path) -> None:
+    (tmp_path / "organ.toml").write_text(to_toml(config()))
+    found, _ = read_config(tmp_path / "organ.toml")
+    assert found.springs.by_name == {"bed": BED}
+
+
+def test_data_and_twin_are_of_a_body_on_springs(built: Path) -> None:
+    data = DataSet(built / "data.zarr")
+    assert data.springs == {"bed": BED}
+    samples = data.samples("test")
+    forces = np.zeros_like(data.body.points)
+    forces[data.response.loaded] = samples.forces[0]
+    with Problem(data.body, data.material, springs={"bed": BED}) as problem:
+        state = problem.solve(forces).displacement
+    np.testing.assert_allclose(samples.displacements[0], state, atol=1e-6 * np.abs(state).max())
+    with Twin.open(built / "twin") as twin:
+        missed = np.linalg.norm(twin.predict(forces).displacement - state, axis=1).mean()
+        rest = twin.predict(np.zeros_like(forces)).displacement
+    assert missed < 0.1 * np.linalg.norm(state, axis=1).mean()
+    assert not rest.any()
+
+
+def test_all_engines_register_it(built: Path) -> None:
+    with Twin.open(built / "twin", "reference") as twin:
+        body = twin.body
+        forces = np.zeros_like(body.points)
+        tool = body.node_sets["tool"]
+        forces[tool] = np.array([0.1, 0.3, 0.6]) / len(tool)
+        truth = twin.predict(forces).displacement
+    assert np.linalg.norm(truth, axis=1).max() > 5e-3
+    cloud = partial_view(body, truth, (0.2, -1.0, 0.4), 600, 3e-4, np.random.default_rng(0))
+    errors = {}
+    for model in ("surrogate", "hybrid", "reference", "torch"):
+        with Twin.open(built / "twin", model, zone="tool") as twin:
+            found = twin.register(cloud)
+        errors[model] = np.linalg.norm(found.displacement - truth, axis=1).mean()
+    assert max(errors.values()) < 6e-4, errors
+    assert abs(errors["reference"] - errors["torch"]) < 1e-6
+    assert abs(errors["reference"] - errors["hybrid"]) < 1e-5
+
+
+def test_another_stiffness_is_another_twin(built: Path) -> None:
+    card = built / "twin" / "organ.toml"
+    before = card.read_text()
+    try:
+        card.write_text(before.replace("bed = 60000.0", "bed = 50000.0"))
+        assert card.read_text() != before
+        with pytest.raises(ConfigError, match=r"organ\.toml was changed after the twin was made: springs"):
+            Twin.open(built / "twin")
+    finally:
+        card.write_text(before)
+
+
+def test_where_they_are_is_an_input_of_the_mesh(tmp_path: Path) -> None:
+    space = workspace(tmp_path)
+    body = mesh_stage(space)
+    heights = body.points[body.surfaces["bed"]][..., 2]
+    assert len(heights) > 0 and heights.max() < 1e-6
+    assert not len(body.fixed)
+    other = workspace(tmp_path, springs={**ENTRIES["springs"], "where": {"bed": "halfspace:0,0,0.02:0,0,-1"}})
+    assert mesh_inputs(space) != mesh_inputs(other)
+    assert mesh_inputs(Workspace(Config(), tmp_path)).keys() == mesh_inputs(Workspace(Config(), tmp_path)).keys()
+
+
+@pytest.mark.parametrize(
+    ("springs", "said"),
+    [
+        ({"where": {"bed": "x"}, "normal": {"bd": 1.0}}, r"springs\.normal: expected names of springs\.where"),
+        ({"where": {"bed": "x"}}, "expected a stiffness above 0"),
+        ({"where": {"bed": "x"}, "normal": {"bed": -1.0}}, r"Springs\.normal: expected a stiffness of 0"),
+        ({"where": {"observed": "x"}, "normal": {"observed": 1.0}}, "a name of its own, got 'observed'"),
+    ],
+)
+def test_what_does_not_belong_together_is_said(springs: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        parse_config({"springs": springs})
+
+
+def test_a_place_without_surface_is_said(tmp_path: Path) -> None:
+    away = {**ENTRIES["springs"], "where": {"bed": "ball:5,5,5:0.01"}}
+    with pytest.raises((BodyError, ValueError), match=r"bed|ball"):
+        mesh_stage(workspace(tmp_path, springs=away))
+    grid = {**ENTRIES["body"], "grid": 0.02}
+    with pytest.raises(ConfigError, match="expected none on a grid"):
+        mesh_stage(workspace(tmp_path, body=grid))
+
+
+def test_nothing_that_holds_is_said(tmp_path: Path) -> None:
+    with pytest.raises(BodyError, match=r"body\.fixed: expected what holds the organ"):
+        mesh_stage(workspace(tmp_path, springs={}))
+    with Problem(bar(), NeoHookean(3000.0, 0.4), held={}, springs={"boundary": BED}) as problem:
+        assert problem.solve(np.zeros_like(problem.body.points)).is_stable
