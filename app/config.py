@@ -466,7 +466,7 @@ class RegistrationSection(Section):
 
     def _check_scan_gravity(self, kinds: list[str]) -> None:
         """The stress-free shape is found once, for what is expected of the tissue."""
-        wrong = [kind for kind in kinds if kind in ("young-modulus", "poisson-ratio", "weight")]
+        wrong = [kind for kind in kinds if kind in ("young-modulus", "poisson-ratio", "springs", "weight")]
         wrong += ["forces = 'normal'"] * (self.forces == "normal")
         if wrong:
             raise ValueError(
@@ -533,6 +533,16 @@ class Config(Section):
     def _radius_is_ordered(self) -> Config:
         if self.loads.radius[0] > self.loads.radius[1]:
             raise ValueError(f"loads.radius: expected smallest <= largest, got {self.loads.radius}")
+        return self
+
+    @model_validator(mode="after")
+    def _springs_are_there(self) -> Config:
+        named = [NamedParameter.parse(text) for text in self.registration.parameters]
+        strange = [each.place for each in named if each.kind == "springs" and each.place not in self.springs.where]
+        if strange:
+            raise ValueError(
+                f"registration.parameters: expected springs@ one of {sorted(self.springs.where)}, got {strange[0]!r}"
+            )
         return self
 
     @model_validator(mode="after")

@@ -16,6 +16,7 @@ from softtwin.registration.parameters.block import ParameterBlock
 from softtwin.registration.parameters.input_block import InputBlock
 from softtwin.registration.parameters.poisson_ratio import PoissonRatio
 from softtwin.registration.parameters.prescribed_motion import PrescribedMotion
+from softtwin.registration.parameters.springs import SpringStiffness
 from softtwin.registration.parameters.young_modulus import YoungModulus
 from softtwin.registration.surface_distance import SurfaceDistance
 
@@ -56,6 +57,10 @@ def _moved(_body: Body, place: str, shift: float | None) -> PrescribedMotion:
     return PrescribedMotion(place) if shift is None else PrescribedMotion(place, translation_deviation=shift)
 
 
+def _springs(_body: Body, name: str, deviation: float | None) -> SpringStiffness:
+    return SpringStiffness(name=name) if deviation is None else SpringStiffness(deviation, name=name)
+
+
 # A new parameter is a block in `softtwin.registration.parameters`, and a line here. A contact is a way of its own.
 KINDS = {
     _MODULUS: Kind(
@@ -65,6 +70,7 @@ KINDS = {
     ),
     "poisson-ratio": Kind("poisson-ratio", _poisson_ratio),
     "moved": Kind("moved@NODES (a zone or node set that moves as a rigid whole)", _moved, placed="always"),
+    "springs": Kind("springs@NAME (how many times as stiff as [springs] says)", _springs, placed="always"),
     "weight": Kind("weight (of gravity: how many times what density and gravity say)", needs_gravity=True),
     "contact": Kind("contact (one patch of unknown place instead of forces anywhere)"),
 }

@@ -166,7 +166,7 @@ class Scenario:
         if named is not None and weight is not None:
             forces = nodal_volumes(body)[:, None] * weight + (buoyancy(body, weight) if self.floats else 0.0)
             forces[body.fixed] = 0.0
-            made.append(Weight(forces) if named.number is None else Weight(forces, named.number))
+            made.append(Weight(forces=forces) if named.number is None else Weight(named.number, forces=forces))
         blocks = tuple(block for block in made if block is not None)
         values = {"young_modulus": self.modulus(modulus, body), "poisson_ratio": ratio}
         return InputBlocks(body, values, blocks) if blocks else None

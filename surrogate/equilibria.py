@@ -187,6 +187,20 @@ class Equilibria:
         other._stiffen()
         return other
 
+    def with_springs(self, factors: Mapping[str, float]) -> Equilibria:
+        """The same body on springs that are stiffer or softer than given.
+
+        Args:
+            factors: how many times as stiff, by the surface that they hold; others as given.
+
+        Raises:
+            ValueError: no springs there.
+        """
+        other = copy.copy(self)
+        other.elastic = self.elastic.with_springs(factors)
+        other._stiffen()
+        return other
+
     def tangent(self, displacement: ArrayLike | Tensor) -> Tangent:
         """What equilibria change by, to first order.
 

@@ -45,6 +45,7 @@ class EquilibriaModel:
         patient: bool = True,
     ) -> None:
         self.solver = self._last = solver
+        self._last_springs: dict[str, float] = {}
         self.discrepancy, self.patient = discrepancy, patient
         shape = solver.body.points.shape
         self._always = np.zeros(shape) if forces is None else checked_array("EquilibriaModel.forces", forces, shape)
@@ -71,7 +72,7 @@ class EquilibriaModel:
             forces: nodal forces; what acts at held nodes moves nothing.
             near: a state to start from, moved along its tangent where it is one of this model's; the warped linear
                 response if not given.
-            inputs: material parameters in place of the solver's own, and more forces.
+            inputs: material parameters in place of the solver's own, more forces, stiffer or softer springs.
 
         Raises:
             ValueError: parameters that the law does not have, or prescribed displacements, which it does not know.
@@ -109,8 +110,11 @@ class EquilibriaModel:
         """The solver with other parameters; the last ones are kept."""
         wanted = {**self.solver.material.parameters, **inputs.parameters}
         known = self._last.material.parameters
-        if wanted.keys() != known.keys() or not all(np.array_equal(wanted[name], known[name]) for name in wanted):
-            self._last = self.solver.with_parameters(**inputs.parameters)
+        is_same = wanted.keys() == known.keys() and all(np.array_equal(wanted[name], known[name]) for name in wanted)
+        if not is_same or inputs.springs != self._last_springs:
+            solver = self.solver.with_springs(inputs.springs) if inputs.springs else self.solver
+            self._last = solver.with_parameters(**inputs.parameters) if inputs.parameters else solver
+            self._last_springs = dict(inputs.springs)
         return self._last
 
     def _start(self, solver: Equilibria, load: Floats, near: Any) -> Floats:
@@ -209,6 +213,9 @@ class EquilibriaState:
             pull = pull + np.asarray(change.forces, dtype=np.float64).reshape(pull.shape)
         if change.parameters:
             pull = pull - self._by_parameters(change.parameters)
+        for name, rate in change.springs.items():
+            at = torch.from_numpy(self.displacement.copy()).to(self._solver.device, self._solver.dtype)[None]
+            pull = pull - rate * self._solver.elastic.spring_forces(name, at)[0].double().cpu().numpy()
         return pull
 
     def _by_parameters(self, changes: dict[str, ArrayLike] | Any) -> Floats:

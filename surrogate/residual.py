@@ -45,7 +45,8 @@ class ElasticBody(nn.Module):
     cells: Tensor
     free: Tensor
     sprung: Tensor
-    spring_stiffness: Tensor
+    spring_parts: Tensor
+    spring_factors: Tensor
     spring_areas: Tensor
 
     def __init__(
@@ -83,7 +84,9 @@ class ElasticBody(nn.Module):
         self.register_buffer("free", torch.from_numpy(is_free))
         held = cell_springs(body, springs)
         self.register_buffer("sprung", torch.from_numpy(held.cells))
-        self.register_buffer("spring_stiffness", torch.from_numpy(held.stiffness))
+        self.register_buffer("spring_parts", torch.from_numpy(held.stiffness))
+        self.register_buffer("spring_factors", torch.ones(len(held.stiffness), dtype=torch.float64))
+        self.springs = tuple(springs)
         self.register_buffer("spring_areas", torch.from_numpy(held.areas))
         for name, values in self._named(material).items():
             self.register_buffer(name, values)
@@ -119,6 +122,40 @@ class ElasticBody(nn.Module):
         other._buffers = {**self._buffers, **values}
         other.material = material
         return other
+
+    def with_springs(self, factors: Mapping[str, float]) -> ElasticBody:
+        """The same with springs that are stiffer or softer than given.
+
+        Args:
+            factors: how many times as stiff, by the surface that they hold; others as given.
+
+        Raises:
+            ValueError: no springs there.
+        """
+        strange = sorted(factors.keys() - set(self.springs))
+        if strange:
+            raise ValueError(
+                f"ElasticBody.with_springs: expected surfaces with springs, {sorted(self.springs)}, got {strange[0]!r}."
+            )
+        other = copy.copy(self)
+        given = [factors.get(name, 1.0) for name in self.springs]
+        values = torch.tensor(given, dtype=torch.float64).to(self.spring_factors)
+        other._buffers = {**self._buffers, "spring_factors": values}
+        return other
+
+    @property
+    def spring_stiffness(self) -> Tensor:
+        """Of all springs in the cells that they hold, (c, 3k, 3k), N/m."""
+        return torch.einsum("n,ncij->cij", self.spring_factors, self.spring_parts)
+
+    def spring_forces(self, name: str, displacement: Tensor) -> Tensor:
+        """Forces, (s, n, 3), newtons, that springs on one surface need as they were given."""
+        cells = self.cells[self.sprung]
+        moved = displacement[:, cells].flatten(2)
+        pulled = torch.einsum("cij,scj->sci", self.spring_parts[self.springs.index(name)], moved)
+        return torch.zeros_like(displacement).index_add(
+            1, cells.reshape(-1), pulled.reshape(len(moved), cells.numel(), 3)
+        )
 
     def _check(self, name: str, field: Tensor) -> None:
         if not isinstance(field, Tensor):

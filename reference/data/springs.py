@@ -67,7 +67,7 @@ class CellSprings:
 
     Args:
         cells: numbers of these cells, (c,).
-        stiffness: of each, node by node, (c, 3k, 3k), N/m.
+        stiffness: of each, node by node, of the springs on each surface, (surfaces, c, 3k, 3k), N/m.
         areas: integral of products of shape functions over the part that is held, (c, k, k), m^2.
     """
 
@@ -97,8 +97,9 @@ def cell_springs(body: Body, springs: Mapping[str, Springs]) -> CellSprings:
     degree = max(quadrature_degree(body), 2 * kind.degree)
     points, weights = quadrature(facet_kind, degree)
     values, slopes = shape_functions(facet_kind, points)
+    count = len(springs)
     found: dict[int, tuple[Floats, Floats]] = {}
-    for name, each in checked_springs(springs, body).items():
+    for number, (name, each) in enumerate(checked_springs(springs, body).items()):
         for facet in (body.facets if name == "boundary" else body.facets_of(name)).tolist():
             cell, place = owners[tuple(sorted(facet))]
             nodes = local[place]
@@ -109,13 +110,16 @@ def cell_springs(body: Body, springs: Mapping[str, Springs]) -> CellSprings:
             across = np.einsum("qi,qj->qij", normals, normals)
             per_area = each.normal * across + each.tangential * (np.eye(3) - across)
             products = np.einsum("q,qa,qb->qab", weights * sizes, values, values)
-            stiffness, area = found.setdefault(cell, (np.zeros((kind.nodes, 3) * 2), np.zeros((kind.nodes,) * 2)))
-            stiffness[np.ix_(nodes, range(3), nodes, range(3))] += np.einsum("qab,qij->aibj", products, per_area)
+            empty = np.zeros((count, *(kind.nodes, 3) * 2)), np.zeros((kind.nodes,) * 2)
+            stiffness, area = found.setdefault(cell, empty)
+            stiffness[number][np.ix_(nodes, range(3), nodes, range(3))] += np.einsum(
+                "qab,qij->aibj", products, per_area
+            )
             area[np.ix_(nodes, nodes)] += products.sum(axis=0)
     cells = np.array(sorted(found), dtype=np.int64)
-    shape = (len(cells), 3 * kind.nodes, 3 * kind.nodes)
+    shape = (count, len(cells), 3 * kind.nodes, 3 * kind.nodes)
     return CellSprings(
         cells,
-        np.array([found[cell][0] for cell in cells]).reshape(shape),
+        np.array([found[cell][0] for cell in cells]).reshape(len(cells), count, *shape[2:]).swapaxes(0, 1).copy(),
         np.array([found[cell][1] for cell in cells]).reshape(len(cells), kind.nodes, kind.nodes),
     )

@@ -34,6 +34,7 @@ class Gradient:
         traction: by the traction on each loaded surface, (3,).
         pressure: by the pressure on each loaded surface.
         points: by node positions at rest, (n, 3), with nodal forces kept; None where it was not asked for.
+        springs: by how many times as stiff springs are, by the surface that they hold.
     """
 
     forces: Floats
@@ -43,6 +44,7 @@ class Gradient:
     traction: dict[str, Floats] = field(default_factory=dict)
     pressure: dict[str, float] = field(default_factory=dict)
     points: Floats | None = None
+    springs: dict[str, float] = field(default_factory=dict)
 
 
 class Linearisation:
@@ -82,6 +84,8 @@ class Linearisation:
         lift = np.zeros(self._space.owned)
         right = self._forces_of(change)
         right -= self._derivatives.by_parameters(self._state, self._parameters_of(change))
+        for name, rate in change.springs.items():
+            right -= rate * self._by_springs(name)
         if change.displacement is not None:
             values = self._space.unknowns("Change.displacement", change.displacement)
             lift[self._space.fixed] = values[self._space.fixed]
@@ -122,6 +126,7 @@ class Linearisation:
             traction=traction,
             pressure=pressure,
             points=derivatives.by_points(self._state, a, self._loading) if points else None,
+            springs={name: -space.dot(a, self._by_springs(name)) for name in self._system.springs},
         )
 
     # ------------------------------------------------------------------ second order
@@ -134,7 +139,7 @@ class Linearisation:
             change: direction; prescribed displacements must stay.
             curvature: second derivative of J times `tangent(change)`, (n, 3); zero if not given, as for a linear J.
         """
-        if change.displacement is not None:
+        if change.displacement is not None or change.springs:
             raise ValueError("Linearisation.hessian_product: expected a change of forces and parameters alone.")
         rate, a = self._tangent(change), self._adjoint(self._space.unknowns("Linearisation.cotangent", cotangent))
         directions = self._parameters_of(change)
@@ -147,6 +152,14 @@ class Linearisation:
             forces=self._space.field(a_rate),
             parameters=self._like_parameters({name: by_cells[name] + first[name] for name in first}),
         )
+
+    def _by_springs(self, name: str) -> Floats:
+        """Derivative of the residual by the factor of springs."""
+        forms = self._system.forms
+        factors = {springs.name: springs.factor for springs in forms.springs}
+        if name not in factors:
+            raise ValueError(f"Change.springs: expected surfaces with springs, {sorted(factors)}, got {name!r}.")
+        return forms.spring_forces(self._state, name) / factors[name]
 
     # ------------------------------------------------------------------ shapes
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -120,14 +120,15 @@ class ReferenceModel:
         )
         if adviser is not None and proposal is not None:
             adviser.learn(found.start == "proposal")
-        return ReferenceState(given, found, self, self.problem.material, self._own)
+        springs = {} if inputs is None else inputs.springs
+        return ReferenceState(given, found, self, self.problem.material, self._own, springs)
 
     def _take(self, inputs: Inputs | None) -> None:
         """Give the problem the parameters that are asked for, or its own ones back."""
         self._look()
         if inputs is None:
             if self._lent is not None:
-                self.problem.set_material(self._own)
+                self._give(Inputs(), self._own)
                 self._lent = None
             return
         unknown = inputs.parameters.keys() - self._own.parameters.keys()
@@ -149,14 +150,21 @@ class ReferenceModel:
         self._own, self._lent = here, None
 
     def _lend(self, inputs: Inputs, material: Material) -> None:
-        self.problem.set_material(material)
+        self._give(inputs, material)
         self._lent = inputs, material
 
-    def take_again(self, material: Material, own: Material) -> None:
+    def _give(self, inputs: Inputs, material: Material) -> None:
+        before = {} if self._lent is None else self._lent[0].springs
+        if inputs.springs != before:
+            self.problem.set_springs(inputs.springs)
+        self.problem.set_material(material)
+
+    def take_again(self, material: Material, own: Material, springs: Mapping[str, float]) -> None:
         """Give the problem back what one of this model's states was found with.
 
         Args:
             material: the state's.
+            springs: factors of its springs.
             own: the problem's own at that time.
 
         Raises:
@@ -169,7 +177,7 @@ class ReferenceModel:
                 f"got {self._own!r}; solve again after set_material."
             )
         if self.problem.material is not material:
-            self._lend(Inputs(material.parameters), material)
+            self._lend(Inputs(material.parameters, springs=springs), material)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +192,7 @@ class ReferenceState:
         model: where it was found.
         material: that the body had then.
         own: the problem's own material then.
+        springs: how many times as stiff as the problem's own they were, by the surface that they hold.
     """
 
     forces: Floats
@@ -191,6 +200,7 @@ class ReferenceState:
     model: ReferenceModel
     material: Material
     own: Material
+    springs: Mapping[str, float]
 
     @property
     def displacement(self) -> Floats:
@@ -211,7 +221,7 @@ class ReferenceState:
     @property
     def _problem(self) -> Problem:
         """The problem, while its tangents are still this state's."""
-        self.model.take_again(self.material, self.own)
+        self.model.take_again(self.material, self.own, self.springs)
         return self.model.problem
 
     def jvp(self, changes: ArrayLike) -> Floats:

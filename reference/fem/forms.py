@@ -237,12 +237,18 @@ class Forms:
         """The stiffness of body and springs times a direction, held unknowns included."""
         return self._body_tangent_times(unknowns, direction) + self.spring_forces(direction)
 
-    def spring_forces(self, unknowns: Floats) -> Floats:
-        """Forces that springs need to be pulled so far, linear in it."""
-        if not self.springs:
+    def spring_forces(self, unknowns: Floats, name: str = "") -> Floats:
+        """Forces that all springs, or those on a named surface, need to be pulled so far, linear in it."""
+        chosen = [springs.force_form for springs in self.springs if name in ("", springs.name)]
+        if not chosen:
             return np.zeros(self.space.owned)
         self.space.set_state(unknowns)
-        return self.assembled(*(springs.force_form for springs in self.springs))
+        return self.assembled(*chosen)
+
+    def set_springs(self, factors: Mapping[str, float]) -> None:
+        """How many times as stiff as given the springs on named surfaces are; others as given."""
+        for springs in self.springs:
+            springs.scale(factors.get(springs.name, 1.0))
 
     def _body_tangent_times(self, unknowns: Floats, direction: Floats) -> Floats:
         if self._tangent_action is None:
@@ -342,12 +348,19 @@ class _SpringForms:
         u, _ = forms.split(space.state)
         across = ufl.inner(u, ufl.FacetNormal(space.mesh))
         self.ds = ds = space.facet_measure(name, max(forms.degree, 2 * space.body.kind.degree))
+        self.name, self.factor, self._given = name, 1.0, springs
         self.normal = k_n = constant(space.mesh, springs.normal)
         self.tangential = k_t = constant(space.mesh, springs.tangential)
         energy = 0.5 * (k_n * across**2 + k_t * (ufl.inner(u, u) - across**2)) * ds
         force = ufl.derivative(energy, space.state, ufl.TestFunction(space.space))
         self.energy_form, self.force_form = form(energy), form(force)
         self.stiffness_form = form(ufl.derivative(force, space.state, ufl.TrialFunction(space.space)))
+
+    def scale(self, factor: float) -> None:
+        """So many times as stiff as they were given."""
+        self.factor = factor
+        self.normal.value = factor * self._given.normal
+        self.tangential.value = factor * self._given.tangential
 
 
 class _SurfaceForms:

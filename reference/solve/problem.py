@@ -122,6 +122,28 @@ class Problem:
         self._newton.forget()
         self._starts.forget()
 
+    def set_springs(self, factors: Mapping[str, float]) -> None:
+        """Springs that are stiffer or softer than they were given; nothing is compiled again.
+
+        Args:
+            factors: how many times as stiff, above 0, by the surface that they hold; others are as given.
+
+        Raises:
+            ValueError: no springs there, or a factor out of range.
+        """
+        strange = sorted(factors.keys() - self.system.springs.keys())
+        if strange:
+            raise ValueError(
+                f"Problem.set_springs: expected surfaces with springs, {sorted(self.system.springs)}, "
+                f"got {strange[0]!r}."
+            )
+        for name, factor in factors.items():
+            if not 0.0 < factor < np.inf:
+                raise ValueError(f"Problem.set_springs[{name!r}]: expected a factor above 0, got {factor}.")
+        self.system.forms.set_springs(factors)
+        self._newton.forget()
+        self._starts.forget()
+
     @property
     def size(self) -> int:
         """How many unknowns there are, held ones and pressures included."""

@@ -106,6 +106,52 @@ def test_all_engines_register_it(built: Path) -> None:
     assert abs(errors["reference"] - errors["hybrid"]) < 1e-5
 
 
+def on_other_springs(built: Path, factor: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Known forces, the state under them on springs so many times as stiff, and a cloud of it."""
+    with Twin.open(built / "twin", "reference") as twin:
+        body, tool = twin.body, twin.body.node_sets["tool"]
+    forces = np.zeros_like(body.points)
+    forces[tool] = np.array([0.5, 0.2, 1.5]) / len(tool)
+    true = {"bed": Springs(factor * BED.normal, factor * BED.tangential)}
+    with Problem(body, NeoHookean(5000.0, 0.45), springs=true) as problem:
+        truth = problem.solve(forces).displacement
+    return forces, truth, partial_view(body, truth, (0.2, -1.0, 0.4), 600, 3e-4, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_stiffness_is_found_where_forces_are_known(built: Path, tmp_path: Path, factor: float) -> None:
+    forces, truth, cloud = on_other_springs(built, factor, 0)
+    np.save(tmp_path / "forces.npy", forces)
+    known = {"forces": "known", "known_forces": str(tmp_path / "forces.npy"), "parameters": ["springs@bed=1"]}
+    with Twin.open(built / "twin", "reference", **known) as twin:
+        found = twin.register(cloud)
+    (stiffness,) = found.estimates
+    assert stiffness.name == "stiffness of the springs bed"
+    low, high = stiffness.interval
+    assert low / 1.05 < factor < 1.05 * high
+    assert high / low < 1.5
+    assert np.linalg.norm(found.displacement - truth, axis=1).mean() < 2e-4
+
+
+def test_engines_agree_on_it_where_forces_are_unknown(built: Path) -> None:
+    """Forces and springs trade places, and the prior decides: all engines say the same, and the state is right."""
+    _, truth, cloud = on_other_springs(built, 0.5, 0)
+    values = {}
+    for model in ("reference", "torch", "hybrid"):
+        with Twin.open(built / "twin", model, zone="tool", parameters=["springs@bed=1"]) as twin:
+            found = twin.register(cloud)
+        assert np.linalg.norm(found.displacement - truth, axis=1).mean() < 6e-4
+        values[model] = found.estimates[0].value
+        low, high = found.estimates[0].interval
+    assert values["torch"] == pytest.approx(values["reference"], rel=1e-3)
+    assert values["hybrid"] == pytest.approx(values["reference"], abs=0.1 * (high - low))
+
+
+def test_springs_that_are_not_there_cannot_be_found(built: Path) -> None:
+    with pytest.raises(ConfigError, match=r"expected springs@ one of \['bed'\], got 'roof'"):
+        Twin.open(built / "twin", "reference", parameters=["springs@roof"])
+
+
 def test_another_stiffness_is_another_twin(built: Path) -> None:
     card = built / "twin" / "organ.toml"
     before = card.read_text()

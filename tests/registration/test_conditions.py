@@ -45,7 +45,7 @@ def everything(body: Body) -> InputBlocks:
         PoissonRatio(0.7),
         PrescribedMotion("tip", 0.1, 0.02),
         Contact(body.boundary_nodes, np.array([0.5, 0.1, 0.2]), 0.1, 0.06, 2.0),
-        Weight(tip_forces(body, (0.1, 0.0, -2.0)), 0.6),
+        Weight(0.6, forces=tip_forces(body, (0.1, 0.0, -2.0))),
     )
     return InputBlocks(body, {"young_modulus": moduli, "poisson_ratio": 0.45}, unknowns)
 

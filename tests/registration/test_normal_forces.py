@@ -103,7 +103,7 @@ def test_a_weight_is_found_by_its_factor(block: Body, model: EquilibriaModel, rn
     weight = nodal_volumes(block)[:, None] * np.array([0.0, 0.0, -2000.0])
     weight[block.fixed] = 0.0
     cloud = whole_cloud(block, model.solve(1.8 * weight).displacement, rng)
-    inputs = InputBlocks(block, {"young_modulus": MODULUS, "poisson_ratio": 0.3}, (Weight(weight, 0.7),))
+    inputs = InputBlocks(block, {"young_modulus": MODULUS, "poisson_ratio": 0.3}, (Weight(0.7, forces=weight),))
     registrar = prepare(model, None, force_scale=1.0, options=options_for(model, True), inputs=inputs)
     found = registrar.register(cloud)
     (known,) = found.estimates

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -12,10 +12,14 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.shapes import beam
+from softtwin.reference.data.inputs import Change, Inputs
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.springs import Springs, cell_springs
+from softtwin.reference.derivatives.linearisation import Linearisation
+from softtwin.reference.derivatives.model import ReferenceModel
 from softtwin.reference.solve.problem import NewtonOptions, Problem
 from softtwin.surrogate.equilibria import Equilibria
+from softtwin.surrogate.equilibria_model import EquilibriaModel
 from softtwin.surrogate.residual import ElasticBody
 from softtwin.surrogate.symmetry import symmetries
 
@@ -101,3 +105,49 @@ def test_a_symmetry_moves_no_spring() -> None:
     loaded = np.arange(len(body.points))
     free, held = symmetries(body, loaded), symmetries(body, loaded, springs=["start", "side"])
     assert len(free) > len(held) == 2  # what swaps ends, or top and bottom, is none any more
+
+
+@pytest.mark.parametrize("engine", ["reference", "torch"])
+def test_stiffness_is_an_input_with_its_derivative(engine: str) -> None:
+    """States move with the factor as the derivative says, and stay what they were when the model goes on."""
+    body = bar("tetrahedron")
+    forces, step = forces_on(body), 1e-4
+    with Problem(body, MATERIAL, NewtonOptions(tolerance=1e-12), springs=SPRINGS) as problem:
+        model: Any = ReferenceModel(problem)
+        if engine == "torch":
+            model = EquilibriaModel(Equilibria(body, MATERIAL, springs=SPRINGS))
+        at = {"start": 0.5, "side": 3.0}
+        state = model.solve(forces, None, Inputs(springs=at))
+        for name, factor in at.items():
+            ahead, behind = (
+                model.solve(forces, state, Inputs(springs={**at, name: factor + sign * step})).displacement
+                for sign in (1.0, -1.0)
+            )
+            wanted = (ahead - behind).ravel() / (2.0 * step)
+            found = state.jvp_inputs([Change(springs={name: 1.0})])[:, 0]
+            np.testing.assert_allclose(found, wanted, atol=1e-5 * np.abs(wanted).max())
+        plain = model.solve(forces).displacement
+        assert np.abs(plain - state.displacement).max() > 1e-4
+    scaled = {name: Springs(at[name] * each.normal, at[name] * each.tangential) for name, each in SPRINGS.items()}
+    for springs, displacement in ((SPRINGS, plain), (scaled, state.displacement)):
+        with Problem(body, MATERIAL, NewtonOptions(tolerance=1e-12), springs=springs) as other:
+            truth = other.solve(forces).displacement
+        np.testing.assert_allclose(displacement, truth, atol=1e-7 * np.abs(truth).max())
+
+
+def test_the_gradient_by_stiffness_is_a_difference() -> None:
+    body, step = bar("tetrahedron"), 1e-4
+    forces, rng = forces_on(body), np.random.default_rng(1)
+    weights = rng.standard_normal(body.points.shape)
+    with Problem(body, MATERIAL, NewtonOptions(tolerance=1e-12), springs=SPRINGS) as problem:
+        state = problem.solve(forces)
+        found = Linearisation(problem, forces, state).gradient(weights).springs
+        values = []
+        for sign in (1.0, -1.0):
+            problem.set_springs({"start": 1.0 + sign * step})
+            values.append(float((problem.solve(forces, state).displacement * weights).sum()))
+        assert found["start"] == pytest.approx((values[0] - values[1]) / (2.0 * step), rel=1e-5)
+        with pytest.raises(ValueError, match="got 'roof'"):
+            problem.set_springs({"roof": 2.0})
+        with pytest.raises(ValueError, match=r"expected a factor above 0, got -1"):
+            problem.set_springs({"start": -1.0})
