@@ -4,10 +4,10 @@
 
 A body of known stress-free shape hangs under its whole weight (1,060 kg/m^3) along each of six directions; what it
 looks like then is the scan, and `unloaded` has to find the body again: by Newton's method on the inverse problem, and
-by Sellier's fixed point on two of these scans (prone and supine). A body is found where its nodes are within 0.01 mm of the true one. Another
-one is another stress-free shape that hangs, balanced and stable, exactly as the scan: the answer is not unique there.
-From a scan prone (the weight along -z) to supine (+z): how far the nodes are from where the true body's go, with the
-body found, and with the scan taken for stress-free and twice the weight put on it.
+by Sellier's fixed point on two of these scans (prone and supine). A body is found where its nodes are within 0.01 mm of
+the true one. Another one is another stress-free shape that hangs, balanced and stable, exactly as the scan: the answer
+is not unique there. From a scan prone (the weight along -z) to supine (+z): how far the nodes are from where the true
+body's go, with the body found, and with the scan taken for stress-free and twice the weight put on it.
 """
 
 from __future__ import annotations
