@@ -487,9 +487,12 @@ class RegistrationSection(Section):
             models = ["reference", "hybrid", "torch"]
         if self.known_forces:  # they are added to those that the network is asked for, where both engines know of them
             models = [model for model in models if model != "surrogate"]
-        if "weight" in kinds:  # it is among the nodal forces then
+        of_gravity = {"weight", "gravity"} & set(kinds)
+        if of_gravity:  # it is among the nodal forces then
             models = ["reference", "torch"]
-        has_weight = any(self.gravity) and "weight" not in kinds
+        if len(of_gravity) > 1:
+            raise ValueError("registration.parameters: expected weight or gravity, got both")
+        has_weight = any(self.gravity) and not of_gravity
         if any(self.scan_gravity):
             self._check_scan_gravity(kinds)
         if has_weight or any(self.scan_gravity) or self.pressure or "moved" in kinds or self.forces == "known":

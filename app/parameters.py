@@ -34,14 +34,14 @@ class Kind:
         input: of the forward model, by the body, the place and the number; None for another kind of block.
         block: any other block, by the observed side, the place and the number; None for an input.
         placed: whether a place belongs to it.
-        needs_gravity: an input, too: that of the known gravity.
+        of_gravity: an input, too: made of gravity and density.
     """
 
     words: str
     input: Callable[[Body, str, float | None], InputBlock] | None = None
     block: Callable[[SurfaceDistance, str, float | None], ParameterBlock] | None = None
     placed: Literal["never", "maybe", "always"] = "never"
-    needs_gravity: bool = False
+    of_gravity: bool = False
 
 
 def _young_modulus(body: Body, place: str, deviation: float | None) -> YoungModulus:
@@ -71,7 +71,8 @@ KINDS = {
     "poisson-ratio": Kind("poisson-ratio", _poisson_ratio),
     "moved": Kind("moved@NODES (a zone or node set that moves as a rigid whole)", _moved, placed="always"),
     "springs": Kind("springs@NAME (how many times as stiff as [springs] says)", _springs, placed="always"),
-    "weight": Kind("weight (of gravity: how many times what density and gravity say)", needs_gravity=True),
+    "weight": Kind("weight (of gravity: how many times what density and gravity say)", of_gravity=True),
+    "gravity": Kind("gravity (its direction and size, near what gravity says)", of_gravity=True),
     "contact": Kind("contact (one patch of unknown place instead of forces anywhere)"),
 }
 
@@ -81,7 +82,7 @@ def words() -> str:
     every = [kind.words for kind in KINDS.values()]
     return (
         f"{', '.join(every[:-1])} or {every[-1]}; =NUMBER behind it is its deviation: of the logarithm, of the "
-        "logistic, metres; of a contact the patch's radius, metres"
+        "logistic, metres, m/s^2; of a contact the patch's radius, metres"
     )
 
 
@@ -122,7 +123,7 @@ class NamedParameter:
     @property
     def is_input(self) -> bool:
         """Whether it is an input of the forward model, which a network has learned one value of."""
-        return KINDS[self.kind].input is not None or KINDS[self.kind].needs_gravity
+        return KINDS[self.kind].input is not None or KINDS[self.kind].of_gravity
 
     def input_block(self, body: Body) -> InputBlock | None:
         """What it is to the model; None where it is no input.

@@ -17,6 +17,7 @@ from softtwin.reference.data.loading import Loading
 from softtwin.reference.data.springs import Springs
 from softtwin.registration.contact import Patch
 from softtwin.registration.parameters.block import ParameterBlock
+from softtwin.registration.parameters.gravity import Gravity
 from softtwin.registration.parameters.input_block import InputBlock
 from softtwin.registration.parameters.inputs import InputBlocks
 from softtwin.registration.parameters.weight import Weight
@@ -96,7 +97,7 @@ class Scenario:
         Raises:
             ParameterError: no such file, or forces of another body.
         """
-        weight = None if self.unknown_weight is not None else self._weight(coordinates)
+        weight = None if self.unknown_weight or self.unknown_gravity else self._weight(coordinates)
         pressure = {"boundary": self.pressure} if self.pressure else {}
         forces = self._known_forces(body, coordinates)
         if self.floats and weight is not None:
@@ -124,6 +125,11 @@ class Scenario:
     def unknown_weight(self) -> NamedParameter | None:
         """The weight as it is named where it is known but for a factor."""
         return next((named for named in self.parameters if named.kind == "weight"), None)
+
+    @property
+    def unknown_gravity(self) -> NamedParameter | None:
+        """Gravity as it is named where its direction is not known."""
+        return next((named for named in self.parameters if named.kind == "gravity"), None)
 
     def _weight(self, coordinates: Coordinates) -> Floats | None:
         return self._force_of(self.gravity, coordinates)
@@ -167,9 +173,26 @@ class Scenario:
             forces = nodal_volumes(body)[:, None] * weight + (buoyancy(body, weight) if self.floats else 0.0)
             forces[body.fixed] = 0.0
             made.append(Weight(forces=forces) if named.number is None else Weight(named.number, forces=forces))
+        if self.unknown_gravity is not None:
+            made.append(self._gravity(body, coordinates))
         blocks = tuple(block for block in made if block is not None)
         values = {"young_modulus": self.modulus(modulus, body), "poisson_ratio": ratio}
         return InputBlocks(body, values, blocks) if blocks else None
+
+    def _gravity(self, body: Body, coordinates: Coordinates) -> Gravity:
+        """Gravity of unknown direction, on the axes of the files.
+
+        Of a body that is scanned under its weight the masses are those of the scanned cells.
+        """
+        volumes = nodal_volumes(body)[:, None]
+        masses = np.zeros((3, *body.points.shape))
+        for axis, unit in enumerate(np.eye(3)):
+            weight = self.density * coordinates.directions(unit)
+            masses[axis] = volumes * weight + (buoyancy(body, weight) if self.floats else 0.0)
+        masses[:, body.fixed] = 0.0
+        named = self.unknown_gravity
+        deviation = Gravity.deviation if named is None or named.number is None else named.number
+        return Gravity(masses, np.array(self.gravity, dtype=np.float64), deviation)
 
     def blocks(self, observed: SurfaceDistance) -> tuple[ParameterBlock, ...]:
         """Parameters that are no inputs of the model.

@@ -11,8 +11,10 @@ from scipy.stats import chi2
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
 from softtwin.app.config import ConfigError, parse_config
+from softtwin.app.scenario import Scenario
 from softtwin.app.twin import Twin
 from softtwin.meshes.body import Body
+from softtwin.meshes.export import Coordinates
 from softtwin.meshes.io import write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.loading import Loading
@@ -116,6 +118,43 @@ def test_what_cannot_go_with_it_is_said() -> None:
         ({"parameters": ["young-modulus"]}, "stress-free shape depends on them, got young-modulus"),
         ({"parameters": ["weight"], "gravity": gravity}, "got weight"),
         ({"forces": "normal"}, "got forces = 'normal'"),
+        ({"parameters": ["weight", "gravity"], "gravity": gravity, "scan_gravity": [0, 0, 0]}, "got both"),
     ):
         with pytest.raises(ConfigError, match=said):
             parse_config({"registration": {"model": "reference", "scan_gravity": gravity, **other}})
+
+
+@pytest.mark.parametrize(("model", "known"), [("reference", 0.5), ("torch", 0.0)])
+def test_gravity_is_found_whichever_way_it_points(folder: Path, model: str, known: float) -> None:
+    """Nobody pulls; a cloud tells the three components, which files in RAS have with two signs turned."""
+    gravity = np.array([2.0, -1.0, 4.0])
+    with Twin.open(folder, model="reference", gravity=tuple(gravity)) as twin:
+        body, truth = twin.body, twin.predict(np.zeros_like(twin.body.points)).displacement
+    rng = np.random.default_rng(0)
+    triangles = body.boundary[rng.integers(len(body.boundary), size=1500)]
+    moved = body.points + truth
+    cloud = np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), size=1500), moved[triangles])
+    cloud += 3e-4 * rng.standard_normal(cloud.shape)
+    expected = known * gravity
+    forces = {"forces": "known"} if model == "reference" else {}
+    with Twin.open(folder, model=model, gravity=tuple(expected), parameters=["gravity=5"], **forces) as twin:
+        found = twin.register(cloud)
+    values = np.array([estimate.value for estimate in found.estimates])
+    halves = np.array([np.ptp(estimate.interval) / 2.0 for estimate in found.estimates])
+    assert [estimate.name for estimate in found.estimates] == [f"gravity along {axis}" for axis in "xyz"]
+    errors = np.linalg.norm(found.displacement - truth, axis=1)
+    assert errors.mean() < 3e-4
+    if model == "reference":
+        assert (np.abs(values - gravity) < 1.5 * halves).all()
+        assert (halves < 0.5).all()
+
+
+def test_gravity_is_on_the_axes_of_the_files(scanned: Body) -> None:
+    entries = {"model": "reference", "gravity": [0.0, 3.0, 1.0], "parameters": ["gravity"]}
+    scenario = Scenario.of(parse_config({"registration": entries}))
+    inputs = scenario.inputs(scanned, MODULUS, RATIO, Coordinates("mm", "ras"))
+    assert inputs is not None
+    net = inputs.forces(np.zeros(3)).sum(axis=0)
+    mass = inputs.forces(np.array([0.0, 0.0, 1.0])).sum(axis=0)[2] - net[2]
+    np.testing.assert_allclose(net / mass * 3.0, [0.0, -3.0, 1.0], atol=1e-9)
+    assert scenario.loading(scanned, Coordinates("mm", "ras")).body_force is None
