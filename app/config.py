@@ -9,9 +9,9 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 import tomlkit
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from softtwin.meshes.attachment import parse_file
-from softtwin.meshes.io import SEGMENTATIONS, Axes
-from softtwin.reference.data.springs import Springs
+from softtwin.meshes.attachment import parse_file, parse_place
+from softtwin.meshes.io import SEGMENTATIONS, Axes, Unit
+from softtwin.reference.data.springs import Ligament, Springs, Support
 
 from .parameters import NamedParameter
 from .parameters import words as words_of_parameters
@@ -114,24 +114,68 @@ class SpringsSection(Section):
         {}, "stiffness per area along it; without one the organ slides there", unit="N/m^3", metavar="NAME=STIFFNESS"
     )
 
+    ligaments: dict[str, str] = option(
+        {},
+        "named cords, each from a place of the organ to a point that stays: X,Y,Z to X,Y,Z on the axes of the files (a "
+        "unit behind a number, else unit)",
+        flag="--ligament",
+        metavar="NAME=PLACES",
+    )
+    stiffness: dict[str, float] = option({}, "of each cord", unit="N/m", metavar="NAME=STIFFNESS")
+    slack: dict[str, float] = option(
+        {},
+        "length beyond which each cord pulls; that of the undeformed organ where nothing is said",
+        unit="metres",
+        metavar="NAME=LENGTH",
+    )
+
     @model_validator(mode="after")
     def _belong_together(self) -> SpringsSection:
-        for word in ("normal", "tangential"):
-            strange = sorted(getattr(self, word).keys() - self.where.keys())
+        for word, of in (
+            ("normal", "where"),
+            ("tangential", "where"),
+            ("stiffness", "ligaments"),
+            ("slack", "ligaments"),
+        ):
+            known = getattr(self, of)
+            strange = sorted(getattr(self, word).keys() - known.keys())
             if strange:
-                raise ValueError(
-                    f"springs.{word}: expected names of springs.where, {sorted(self.where)}, got {strange[0]!r}"
-                )
-        taken = sorted(self.where.keys() & {"fixed", "observed", "boundary"})
+                raise ValueError(f"springs.{word}: expected names of springs.{of}, {sorted(known)}, got {strange[0]!r}")
+        taken = sorted(self.where.keys() & ({"fixed", "observed", "boundary"} | self.ligaments.keys()))
         if taken:
             raise ValueError(f"springs.where: expected a name of its own, got {taken[0]!r}")
-        _ = self.by_name
+        without = sorted(self.ligaments.keys() - self.stiffness.keys())
+        if without:
+            raise ValueError(f"springs.stiffness: expected one for the ligament {without[0]!r}, got none")
+        self.supports("m", False)
         return self
 
     @property
-    def by_name(self) -> dict[str, Springs]:
-        """The springs of each part."""
-        return {name: Springs(self.normal.get(name, 0.0), self.tangential.get(name, 0.0)) for name in self.where}
+    def names(self) -> list[str]:
+        """Of all springs and ligaments, sorted."""
+        return sorted({*self.where, *self.ligaments})
+
+    def supports(self, unit: Unit, is_ras: bool) -> dict[str, Support]:
+        """The springs of each part, and ligaments.
+
+        Args:
+            unit: of coordinates without one.
+            is_ras: coordinates are on the axes RAS, in place of LPS.
+
+        Raises:
+            ValueError: places that cannot be read, stiffnesses out of range.
+        """
+        found: dict[str, Support] = {
+            name: Springs(self.normal.get(name, 0.0), self.tangential.get(name, 0.0)) for name in self.where
+        }
+        for name, text in self.ligaments.items():
+            ends = text.split(" to ")
+            if len(ends) != 2:
+                raise ValueError(f"springs.ligaments.{name}: expected X,Y,Z to X,Y,Z, got {text!r}")
+            sign = -1.0 if is_ras else 1.0
+            place, anchor = ((sign * x, sign * y, z) for x, y, z in (parse_place(end, unit) for end in ends))
+            found[name] = Ligament(place, anchor, self.stiffness[name], self.slack.get(name))
+        return found
 
 
 Law = Literal["neo-hookean", "saint-venant-kirchhoff", "isochoric-neo-hookean", "linear-elastic"]
@@ -538,13 +582,18 @@ class Config(Section):
             raise ValueError(f"loads.radius: expected smallest <= largest, got {self.loads.radius}")
         return self
 
+    @property
+    def supports(self) -> dict[str, Support]:
+        """The springs of each part of the surface, and ligaments, by name."""
+        return self.springs.supports(self.body.unit, files_axes(self.body) == "ras")
+
     @model_validator(mode="after")
     def _springs_are_there(self) -> Config:
         named = [NamedParameter.parse(text) for text in self.registration.parameters]
-        strange = [each.place for each in named if each.kind == "springs" and each.place not in self.springs.where]
+        strange = [each.place for each in named if each.kind == "springs" and each.place not in self.springs.names]
         if strange:
             raise ValueError(
-                f"registration.parameters: expected springs@ one of {sorted(self.springs.where)}, got {strange[0]!r}"
+                f"registration.parameters: expected springs@ one of {self.springs.names}, got {strange[0]!r}"
             )
         return self
 

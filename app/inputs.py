@@ -15,6 +15,7 @@ from softtwin.meshes.io import is_segmentation, read_body, structure_files
 from softtwin.reference.data.dataset import DataSet, DataSetError, differences, existing
 from softtwin.reference.data.jacobians import mark
 from softtwin.reference.data.samplers import LoadPlan
+from softtwin.reference.data.springs import Support
 
 from .config import Config, ConfigError
 from .workspace import Workspace, read_records
@@ -48,7 +49,7 @@ def plan_entries(config: Config) -> dict[str, Any]:
         del loads["sequence"]  # as in a data set's header
     if not samples.smooth:
         del loads["smoothness"]
-    springs = {name: asdict(each) for name, each in config.springs.by_name.items()}
+    springs = {name: _plain(each) for name, each in config.supports.items()}
     return {
         **{word: getattr(config.material, name) for name, word in _MATERIAL.items()},
         "loads": loads,
@@ -64,6 +65,11 @@ def plan_entries(config: Config) -> dict[str, Any]:
         "newton": config.solver.model_dump(),
         **({"springs": springs} if springs else {}),
     }
+
+
+def _plain(each: Support) -> dict[str, Any]:
+    """Springs in the words of a data set's header, which is JSON."""
+    return dict(json.loads(json.dumps(asdict(each))))
 
 
 def mesh_inputs(space: Workspace) -> dict[str, Any]:
@@ -201,7 +207,7 @@ def check_material(twin: Path, config: Config) -> None:
     """
     try:
         learned = json.loads((twin / "surrogate.json").read_text())["data"]["plan"]
-        springs = {name: asdict(each) for name, each in config.springs.by_name.items()}
+        springs = {name: _plain(each) for name, each in config.supports.items()}
         wrong = [] if learned.get("springs", {}) == springs else ["springs"]
         wrong += [
             f"material.{name} ({learned[word]} learned, {getattr(config.material, name)} in organ.toml)"

@@ -14,7 +14,7 @@ from softtwin.meshes.embedding import outer
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.metrics import nodal_volumes
 from softtwin.reference.data.loading import Loading
-from softtwin.reference.data.springs import Springs
+from softtwin.reference.data.springs import Support
 from softtwin.registration.contact import Patch
 from softtwin.registration.parameters.block import ParameterBlock
 from softtwin.registration.parameters.gravity import Gravity
@@ -51,7 +51,7 @@ class Scenario:
     pressure: float
     density: float
     scan_gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    springs: Mapping[str, Springs] = field(default_factory=dict)
+    springs: Mapping[str, Support] = field(default_factory=dict)
     floats: bool = False
 
     @classmethod
@@ -65,7 +65,7 @@ class Scenario:
             section.pressure,
             config.material.density,
             section.scan_gravity,
-            config.springs.by_name,
+            config.supports,
             section.forces == "normal",
         )
 

@@ -55,7 +55,7 @@ from .workspace import open_workspace
 
 if TYPE_CHECKING:
     from softtwin.reference.data.materials import Material
-    from softtwin.reference.data.springs import Springs
+    from softtwin.reference.data.springs import Support
     from softtwin.reference.unloaded import Unloaded
     from softtwin.surrogate.equilibria_model import EquilibriaModel
     from softtwin.surrogate.error_bound import ErrorBound, ErrorEstimator
@@ -852,7 +852,7 @@ def _unloaded(scenario: Scenario, body: Body, material: Material, coordinates: C
 def _solved_in_torch(
     body: Body,
     material: Material,
-    springs: Mapping[str, Springs],
+    springs: Mapping[str, Support],
     known: ArrayLike | None,
     further: Discrepancy | None,
 ) -> EquilibriaModel:

@@ -140,6 +140,26 @@ def parse_region(text: str, unit: Unit = "m") -> Region:
         raise RegionError(f"{text!r}: {error}") from None
 
 
+def parse_place(text: str, unit: Unit = "m") -> Vector:
+    """A point that a text describes, metres: `X,Y,Z`, with a unit behind the last number where it has another.
+
+    Args:
+        text: the description.
+        unit: of lengths without a unit of their own.
+
+    Raises:
+        RegionError: what was expected and what came.
+    """
+    try:
+        shape = _parse_shape("seen-from", [text.strip()], unit)
+    except RegionError:
+        raise
+    except ValueError as error:
+        raise RegionError(f"{text!r}: {error}") from None
+    assert isinstance(shape, SeenFrom)
+    return shape.position
+
+
 def parse_regions(text: str, unit: Unit = "m", root: Path = Path()) -> tuple[Region, ...]:
     """The regions of a text, whose union is meant: ` + ` stands between them.
 

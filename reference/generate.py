@@ -48,7 +48,7 @@ from .data.samplers import (
 )
 from .data.schema import Reason
 from .data.shard import Shard, at_work_on, refuse_shards_at_work
-from .data.springs import Springs, springs_of
+from .data.springs import Support, springs_of
 from .data.writing import create, drop_block, write_block
 from .farm import Task, quiet, share_out
 from .fem.fenicsx import MPI, PETSc, dolfinx
@@ -98,7 +98,7 @@ class Plan:
     ramp: int = 1
     seed: int = 0
     newton: NewtonOptions = field(default_factory=NewtonOptions)
-    springs: Mapping[str, Springs] = field(default_factory=dict)
+    springs: Mapping[str, Support] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.material not in MATERIALS:

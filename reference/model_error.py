@@ -27,6 +27,7 @@ from softtwin.meshes.solidify import solidify
 
 from .data.dataset import DataSet, Samples
 from .data.outcome import NotConverged
+from .data.springs import on_surfaces
 from .farm import share_out
 from .fem.fenicsx import MPI
 from .generate import Plan, plan_from_header, writing
@@ -205,7 +206,11 @@ def _difference(
         moved = _supported(data, translation, body)
         if moved is None:
             return None
-        if carrier is None and ensemble.poisson_ratio is None and _is_supported_alike(moved, body, plan.springs):
+        if (
+            carrier is None
+            and ensemble.poisson_ratio is None
+            and _is_supported_alike(moved, body, on_surfaces(plan.springs).keys() - {"boundary"})
+        ):
             return np.zeros(body.points.size)
         body = moved
         forces[body.fixed] = 0.0
@@ -234,7 +239,7 @@ def _supported(data: DataSet, translation: Floats, body: Body) -> Body | None:
             return None
         body = body.with_sets(fixed=held)
     surfaces = dict(body.surfaces)
-    for name in data.springs.keys() - {"boundary"}:
+    for name in on_surfaces(data.springs).keys() - {"boundary"}:
         nodes = shifted(model, translation, body, np.unique(model.surfaces[name]))
         surfaces[name] = body.boundary[np.isin(body.boundary, nodes).all(axis=1)]
         if not len(surfaces[name]):
@@ -244,7 +249,7 @@ def _supported(data: DataSet, translation: Floats, body: Body) -> Body | None:
 
 def _is_supported_alike(body: Body, other: Body, springs: Iterable[str]) -> bool:
     """Whether two supports of one mesh are the same."""
-    surfaces = (np.array_equal(body.surfaces[name], other.surfaces[name]) for name in springs if name != "boundary")
+    surfaces = (np.array_equal(body.surfaces[name], other.surfaces[name]) for name in springs)
     return np.array_equal(body.fixed, other.fixed) and all(surfaces)
 
 

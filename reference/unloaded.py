@@ -15,7 +15,7 @@ from softtwin.meshes.embedding import carried, outer
 from .data.loading import Loading
 from .data.materials import Material
 from .data.outcome import Equilibrium, NotConverged
-from .data.springs import Springs
+from .data.springs import Support, ligaments_of
 from .fem.fenicsx import MPI
 from .fem.inverse_forms import InverseForms
 from .solve.linear import LinearSolver
@@ -68,7 +68,7 @@ def unloaded(
     load: Loading | ArrayLike,
     *,
     held: Mapping[str, str] | None = None,
-    springs: Mapping[str, Springs] | None = None,
+    springs: Mapping[str, Support] | None = None,
     method: Method = "newton",
     options: NewtonOptions | None = None,
     quadrature: int | None = None,
@@ -97,6 +97,10 @@ def unloaded(
         ValueError: as `Problem` says, or another method.
         NotConverged: no such body was found; for loads too great for the tissue there is none.
     """
+    if ligaments_of(springs or {}):
+        raise ValueError(
+            "unloaded.springs: expected springs on surfaces, got ligaments, whose length without load is not known."
+        )
     if method not in _METHODS:
         raise ValueError(f"unloaded.method: expected one of {_METHODS}, got {method!r}.")
     given = {"held": held, "springs": springs, "options": options, "quadrature": quadrature, "comm": comm}

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.materials import Material, Parameter, with_parameters
-from softtwin.reference.data.springs import Springs
+from softtwin.reference.data.springs import Support
 
 from .residual import ElasticBody
 from .tangents import Factors, LayeredMatrices, layers_of
@@ -126,7 +126,7 @@ class Equilibria:
         device: str | torch.device = "cpu",
         precision: str = "double",
         settings: NewtonSettings | None = None,
-        springs: Mapping[str, Springs] = MappingProxyType({}),
+        springs: Mapping[str, Support] = MappingProxyType({}),
     ) -> None:
         if precision not in ("double", "single"):
             raise ValueError(f"Equilibria.precision: expected 'double' or 'single', got {precision!r}.")

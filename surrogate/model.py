@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from softtwin.meshes.body import Body
 from softtwin.reference.data.discrepancy import Discrepancy
 from softtwin.reference.data.loading import checked_array
-from softtwin.reference.data.springs import Springs, springs_of
+from softtwin.reference.data.springs import Support, springs_of
 
 from .architecture import Linearisation, Network
 from .encoder_decoder import LinearEncoderDecoder
@@ -149,7 +149,7 @@ class Surrogate:
         return {name: plan[name] for name in names} if all(name in plan for name in names) else None
 
     @property
-    def learned_springs(self) -> dict[str, Springs]:
+    def learned_springs(self) -> dict[str, Support]:
         """That held the body in what it has learned from, by the surface that they held."""
         return springs_of(self.card.get("data", {}).get("plan", {}))
 

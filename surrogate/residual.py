@@ -16,9 +16,10 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.elements import linear_kind
 from softtwin.meshes.quadrature import quadrature, quadrature_degree, shape_functions
 from softtwin.reference.data.materials import Energy, Material
-from softtwin.reference.data.springs import Springs, cell_springs
+from softtwin.reference.data.springs import Support, cell_springs, on_surfaces
 
 from .algebra import TorchAlgebra
+from .ligaments import Ligaments
 
 
 class ElasticBody(nn.Module):
@@ -55,7 +56,7 @@ class ElasticBody(nn.Module):
         material: Material,
         weights: ArrayLike | None = None,
         *,
-        springs: Mapping[str, Springs] = MappingProxyType({}),
+        springs: Mapping[str, Support] = MappingProxyType({}),
         minimum_jacobian: float = 0.0,
     ) -> None:
         super().__init__()
@@ -82,12 +83,13 @@ class ElasticBody(nn.Module):
         is_free = np.ones((self.nodes, 1))
         is_free[body.fixed] = 0.0
         self.register_buffer("free", torch.from_numpy(is_free))
-        held = cell_springs(body, springs)
+        held = cell_springs(body, on_surfaces(springs))
         self.register_buffer("sprung", torch.from_numpy(held.cells))
         self.register_buffer("spring_parts", torch.from_numpy(held.stiffness))
         self.register_buffer("spring_factors", torch.ones(len(held.stiffness), dtype=torch.float64))
-        self.springs = tuple(springs)
+        self.springs = tuple(on_surfaces(springs))
         self.register_buffer("spring_areas", torch.from_numpy(held.areas))
+        self.ligaments = Ligaments(body, springs)
         for name, values in self._named(material).items():
             self.register_buffer(name, values)
 
@@ -132,12 +134,14 @@ class ElasticBody(nn.Module):
         Raises:
             ValueError: no springs there.
         """
-        strange = sorted(factors.keys() - set(self.springs))
+        known = {*self.springs, *self.ligaments.names}
+        strange = sorted(factors.keys() - known)
         if strange:
             raise ValueError(
-                f"ElasticBody.with_springs: expected surfaces with springs, {sorted(self.springs)}, got {strange[0]!r}."
+                f"ElasticBody.with_springs: expected names of springs, {sorted(known)}, got {strange[0]!r}."
             )
         other = copy.copy(self)
+        other._modules = {**self._modules, "ligaments": self.ligaments.scaled(factors)}
         given = [factors.get(name, 1.0) for name in self.springs]
         values = torch.tensor(given, dtype=torch.float64).to(self.spring_factors)
         other._buffers = {**self._buffers, "spring_factors": values}
@@ -149,7 +153,9 @@ class ElasticBody(nn.Module):
         return torch.einsum("n,ncij->cij", self.spring_factors, self.spring_parts)
 
     def spring_forces(self, name: str, displacement: Tensor) -> Tensor:
-        """Forces, (s, n, 3), newtons, that springs on one surface need as they were given."""
+        """Forces, (s, n, 3), newtons, that springs, or a ligament, of one name need as they were given."""
+        if name in self.ligaments.names:
+            return self.ligaments.forces(displacement, name)
         cells = self.cells[self.sprung]
         moved = displacement[:, cells].flatten(2)
         pulled = torch.einsum("cij,scj->sci", self.spring_parts[self.springs.index(name)], moved)
@@ -181,7 +187,12 @@ class ElasticBody(nn.Module):
         """Strain energy, and that of springs, (s,), joules; NaN where the law is none for a cell inside out."""
         F = self.deformation_gradients(displacement)
         stored = (self.density(F) * self.volumes).sum(dim=(1, 2))
-        return stored + self._spring_energy(displacement) if len(self.sprung) else stored
+        return stored + self._support_energy(displacement)
+
+    def _support_energy(self, displacement: Tensor) -> Tensor:
+        """Of springs and ligaments, (s,), joules."""
+        found = self.ligaments.energy(displacement)
+        return found + self._spring_energy(displacement) if len(self.sprung) else found
 
     def _pulled(self, displacement: Tensor) -> tuple[Tensor, Tensor]:
         """Displacements of the cells that springs hold, and what these need for it, (s, c, 3k) each."""
@@ -193,6 +204,8 @@ class ElasticBody(nn.Module):
         return 0.5 * (moved * pulled).sum(dim=(1, 2))
 
     def _with_spring_forces(self, forces: Tensor, displacement: Tensor) -> Tensor:
+        if self.ligaments.names:
+            forces = forces + self.ligaments.forces(displacement)
         if not len(self.sprung):
             return forces
         cells = self.cells[self.sprung]
@@ -221,8 +234,7 @@ class ElasticBody(nn.Module):
         density = density.detach()
         is_sound = (TorchAlgebra(F).det(F.detach()) > 0.0) | self.material.is_linear
         energy = torch.where(is_sound, density * self.volumes, torch.inf).sum(dim=(1, 2))
-        if len(self.sprung):
-            energy = energy + self._spring_energy(displacement).detach()
+        energy = energy + self._support_energy(displacement).detach()
         return energy, self._with_spring_forces(self.assembled(stress), displacement.detach())
 
     def assembled(self, stress: Tensor) -> Tensor:
@@ -243,6 +255,8 @@ class ElasticBody(nn.Module):
         found = (behind @ ahead).reshape(len(F), cells, 3 * nodes, 3 * nodes)
         if len(self.sprung):
             found = found.index_add(1, self.sprung, self.spring_stiffness.expand(len(F), -1, -1, -1))
+        if self.ligaments.names:
+            found = found.index_add(1, self.ligaments.cells, self.ligaments.stiffness(displacement))
         return found
 
     def moduli(self, F: Tensor) -> Tensor:
@@ -294,4 +308,4 @@ class ElasticBody(nn.Module):
         """Stored energy of all states together, joules, as a function of displacements and parameters."""
         F = self.deformation_gradients(displacement)
         stored = (self.density_of(F, parameters) * self.volumes).sum()
-        return stored + self._spring_energy(displacement).sum() if len(self.sprung) else stored
+        return stored + self._support_energy(displacement).sum()

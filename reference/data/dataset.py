@@ -20,7 +20,7 @@ from softtwin.meshes.embedding import outer
 from . import schema
 from .materials import MATERIALS, Material
 from .schema import Reason
-from .springs import Springs, springs_of
+from .springs import Support, springs_of
 from .store import StoreError, is_tensors, open_store
 
 Floats = NDArray[np.float64]
@@ -180,7 +180,7 @@ class DataSet:
             raise DataSetError(f"DataSet: expected a known material in the header of {self.path}, got none.") from error
 
     @property
-    def springs(self) -> dict[str, Springs]:
+    def springs(self) -> dict[str, Support]:
         """That hold the body beside its fixed nodes, by the surface that they hold."""
         return springs_of(self.header.get("plan", {}))
 

@@ -1,4 +1,4 @@
-"""Supports that give way: springs spread over a part of the surface, as ligaments and neighbours hold an organ."""
+"""Supports that give way: springs spread over a part of the surface, and ligaments from a place to a fixed point."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.elements import KINDS
+from softtwin.meshes.embedding import Embedding, embed, is_carried_along
 from softtwin.meshes.quadrature import quadrature, quadrature_degree, shape_functions
 
 Floats = NDArray[np.float64]
+_TAUT = 1e-12  # of a length: rounding
 
 
 @dataclass(frozen=True)
@@ -43,22 +45,111 @@ class Springs:
             raise ValueError("Springs: expected a stiffness above 0 N/m^3 across or along the surface, got none.")
 
 
-def springs_of(plan: Mapping[str, Any]) -> dict[str, Springs]:
-    """The springs in the plan of a data set or of a twin's card, by the surface that they hold."""
-    return {name: Springs(**each) for name, each in plan.get("springs", {}).items()}
+@dataclass(frozen=True)
+class Ligament:
+    """A cord from a place of the organ to a point that stays: it pulls where it is longer than its slack length.
 
+    Energy k/2 (l - l0)^2 of a length l above l0. Not smooth where it becomes slack; at l0 itself it counts as taut.
 
-def checked_springs(springs: Mapping[str, Springs], body: Body) -> dict[str, Springs]:
-    """Springs by the surface that they hold.
+    Args:
+        place: on or in the organ at rest, (3,), metres; moved by the nodes of its cell.
+        anchor: the other end, (3,), metres.
+        stiffness: k, N/m.
+        slack: l0, metres; the distance of both ends at rest if not given, and less for one that pulls at rest.
 
     Raises:
-        ValueError: a surface that the body does not have.
+        ValueError: numbers that are not finite, a stiffness that is not positive, a negative length, both ends in one
+            place.
+    """
+
+    place: tuple[float, float, float]
+    anchor: tuple[float, float, float]
+    stiffness: float
+    slack: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("place", "anchor"):
+            values = tuple(map(float, getattr(self, name)))
+            if len(values) != 3 or not np.isfinite(values).all():
+                raise ValueError(f"Ligament.{name}: expected three finite coordinates, metres, got {values}.")
+            object.__setattr__(self, name, values)
+        if not 0.0 < self.stiffness < np.inf:
+            raise ValueError(f"Ligament.stiffness: expected more than 0 N/m, got {self.stiffness}.")
+        if self.slack is not None and not 0.0 <= self.slack < np.inf:
+            raise ValueError(f"Ligament.slack: expected a length of 0 m or more, got {self.slack}.")
+        if self.place == self.anchor:
+            raise ValueError(f"Ligament.anchor: expected another point than the place, got {self.anchor} for both.")
+
+    @property
+    def length(self) -> float:
+        """Beyond which it pulls, metres."""
+        return float(np.linalg.norm(np.subtract(self.place, self.anchor))) if self.slack is None else self.slack
+
+    def pull(self, moved: Floats) -> tuple[float, Floats, Floats]:
+        """Energy, J, its gradient, (3,), N, and its second derivative, (3, 3), N/m, where the place has moved.
+
+        Args:
+            moved: displacement of the place, (3,), metres.
+        """
+        apart = np.add(self.place, moved) - self.anchor
+        length = float(np.linalg.norm(apart))
+        stretch = length - self.length
+        if stretch < -_TAUT * length:
+            return 0.0, np.zeros(3), np.zeros((3, 3))
+        along = apart / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
+        stretch = max(stretch, 0.0)
+        across = stretch / length if length > 0.0 else 1.0
+        pulled = np.outer(along, along)
+        stiffness = self.stiffness * (pulled + across * (np.eye(3) - pulled))
+        return 0.5 * self.stiffness * stretch**2, self.stiffness * stretch * along, stiffness
+
+    def carried(self, name: str, body: Body) -> Embedding:
+        """The place as its cell carries it.
+
+        Raises:
+            ValueError: it is not on the organ.
+        """
+        found = embed(body, np.array([self.place]))
+        if is_carried_along(body, found)[0]:
+            raise ValueError(
+                f"Problem.springs[{name!r}].place: expected a place on the organ, got one {1e3 * found.outside[0]:.1f} "
+                "mm away from it."
+            )
+        return found
+
+
+Support = Springs | Ligament
+
+
+def springs_of(plan: Mapping[str, Any]) -> dict[str, Support]:
+    """The springs in the plan of a data set or of a twin's card, by name."""
+    given = plan.get("springs", {}).items()
+    return {name: Ligament(**each) if "anchor" in each else Springs(**each) for name, each in given}
+
+
+def checked_springs(springs: Mapping[str, Support], body: Body) -> dict[str, Support]:
+    """Springs by the surface that they hold, ligaments by a name of their own.
+
+    Raises:
+        ValueError: a surface that the body does not have, or a ligament that is not on it.
     """
     known = sorted({*body.surfaces, "boundary"})
-    for name in springs:
-        if name not in known:
+    for name, each in springs.items():
+        if isinstance(each, Ligament):
+            each.carried(name, body)
+        elif name not in known:
             raise ValueError(f"Problem.springs: expected a surface among {known}, got {name!r}.")
     return dict(springs)
+
+
+def on_surfaces(springs: Mapping[str, Support]) -> dict[str, Springs]:
+    """Those that are spread over surfaces."""
+    return {name: each for name, each in springs.items() if isinstance(each, Springs)}
+
+
+def ligaments_of(springs: Mapping[str, Support]) -> dict[str, Ligament]:
+    """Those that are cords."""
+    return {name: each for name, each in springs.items() if isinstance(each, Ligament)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +177,7 @@ def cell_springs(body: Body, springs: Mapping[str, Springs]) -> CellSprings:
     Raises:
         ValueError: a surface that the body does not have.
     """
+    checked_springs(springs, body)
     kind = body.kind
     local = np.array(kind.facets)
     owners = {
@@ -99,7 +191,7 @@ def cell_springs(body: Body, springs: Mapping[str, Springs]) -> CellSprings:
     values, slopes = shape_functions(facet_kind, points)
     count = len(springs)
     found: dict[int, tuple[Floats, Floats]] = {}
-    for number, (name, each) in enumerate(checked_springs(springs, body).items()):
+    for number, (name, each) in enumerate(springs.items()):
         for facet in (body.facets if name == "boundary" else body.facets_of(name)).tolist():
             cell, place = owners[tuple(sorted(facet))]
             nodes = local[place]

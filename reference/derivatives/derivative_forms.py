@@ -133,7 +133,7 @@ class DerivativeForms:
                     lambda pressed=pressed: ufl.derivative(pressed, self.space.state, self._test()),
                 )
             )
-        return self.forms.assembled(*parts) + self.forms.spring_forces(a)
+        return self.forms.assembled(*parts) + self.forms.supports_times(state, a)
 
     def by_loads(
         self, state: Floats, a: Floats, loading: Loading

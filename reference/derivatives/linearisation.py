@@ -139,6 +139,10 @@ class Linearisation:
             change: direction; prescribed displacements must stay.
             curvature: second derivative of J times `tangent(change)`, (n, 3); zero if not given, as for a linear J.
         """
+        if self._system.forms.ligaments:
+            raise ValueError(
+                "Linearisation.hessian_product: expected a body without ligaments, whose curvature is not known here."
+            )
         if change.displacement is not None or change.springs:
             raise ValueError("Linearisation.hessian_product: expected a change of forces and parameters alone.")
         rate, a = self._tangent(change), self._adjoint(self._space.unknowns("Linearisation.cotangent", cotangent))
@@ -156,7 +160,7 @@ class Linearisation:
     def _by_springs(self, name: str) -> Floats:
         """Derivative of the residual by the factor of springs."""
         forms = self._system.forms
-        factors = {springs.name: springs.factor for springs in forms.springs}
+        factors = forms.spring_factors
         if name not in factors:
             raise ValueError(f"Change.springs: expected surfaces with springs, {sorted(factors)}, got {name!r}.")
         return forms.spring_forces(self._state, name) / factors[name]

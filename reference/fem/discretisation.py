@@ -16,7 +16,7 @@ from softtwin.meshes.body import Body
 from softtwin.meshes.elements import Kind, linear_kind
 
 from ..data.loading import checked_array
-from ..data.springs import Springs
+from ..data.springs import Ligament, Springs, Support, on_surfaces
 from .fenicsx import (
     MPI,
     cell_dofs,
@@ -58,7 +58,7 @@ class Discretisation:
         mixed: bool,
         held: Mapping[str, str],
         comm: Any = MPI.COMM_SELF,
-        springs: Mapping[str, Springs] | None = None,
+        springs: Mapping[str, Support] | None = None,
     ) -> None:
         self.body, self.mixed, self.comm = body, mixed, comm
         kind = linear_kind(body.kind) if body.is_straight else body.kind
@@ -279,9 +279,24 @@ def _sprung(body: Body, name: str, springs: Springs, motions: Floats) -> Floats:
     return np.hstack([*parts, *[along.reshape(len(motions), -1)] * (springs.tangential > 0.0)])
 
 
-def _check_rigid(body: Body, mask: NDArray[np.bool_], springs: Mapping[str, Springs]) -> None:
+def _tied(body: Body, name: str, ligament: Ligament, motions: Floats) -> Floats:
+    """What a ligament resists of rigid motions, (m, 3): all where it pulls at rest, none where it is slack."""
+    carried = ligament.carried(name, body)
+    stiffness = ligament.pull(np.zeros(3))[2] / ligament.stiffness
+    return np.asarray(np.einsum("k,mki->mi", carried.weights[0], motions[:, carried.nodes[0]]) @ stiffness)
+
+
+def _check_rigid(body: Body, mask: NDArray[np.bool_], springs: Mapping[str, Support]) -> None:
+    if springs and not mask.any() and not on_surfaces(springs):
+        raise ValueError(
+            "Problem.springs: expected held nodes, or springs on a surface, beside ligaments, got ligaments alone."
+        )
     motions = rigid_motions(body.points)
-    held = np.hstack([motions[:, mask], *(_sprung(body, name, each, motions) for name, each in springs.items())])
+    resisted = (
+        _tied(body, name, each, motions) if isinstance(each, Ligament) else _sprung(body, name, each, motions)
+        for name, each in springs.items()
+    )
+    held = np.hstack([motions[:, mask], *resisted])
     left = len(motions) - (int(np.linalg.matrix_rank(held, tol=1e-9 * np.sqrt(len(body.points)))) if held.size else 0)
     if left:
         raise ValueError(

@@ -14,7 +14,7 @@ from softtwin.meshes.quadrature import quadrature_degree
 
 from ..data.loading import Loading
 from ..data.materials import Energy, Material, Parameter, is_same_law
-from ..data.springs import Springs
+from ..data.springs import Springs, Support, ligaments_of, on_surfaces
 from .assembly import CellSum, suits
 from .discretisation import Discretisation
 from .fenicsx import (
@@ -32,6 +32,7 @@ from .fenicsx import (
     sparsity,
     ufl,
 )
+from .ligaments import LigamentForms
 
 Floats = NDArray[np.float64]
 
@@ -82,7 +83,7 @@ class Forms:
         material: Material,
         weights: Floats | None = None,
         degree: int | None = None,
-        springs: Mapping[str, Springs] | None = None,
+        springs: Mapping[str, Support] | None = None,
     ) -> None:
         self.space, self.material = space, material
         self.degree = degree or quadrature_degree(space.body, material.is_mixed)
@@ -96,7 +97,9 @@ class Forms:
         self.direction = fem.Function(space.space)
         self.reactions = np.zeros(len(space.fixed))  # at held unknowns, where the residual was last asked for
         self._compile()
-        self.springs = [_SpringForms(self, name, each) for name, each in (springs or {}).items()]
+        given = springs or {}
+        self.springs = [_SpringForms(self, name, each) for name, each in on_surfaces(given).items()]
+        self.ligaments = [LigamentForms(space, name, each) for name, each in ligaments_of(given).items()]
 
     def parameter(self, name: str, value: Parameter) -> Any:
         """A parameter as forms read it: a number that another may replace without compiling, or one for each cell."""
@@ -211,6 +214,8 @@ class Forms:
         self.space.set_state(unknowns)
         further = [*(s.force_form for s in self.springs), *(s.pressure_form for s in self._pressed(load))]
         out = self.assembled(self._residual, *further) - load.dead
+        for ligament in self.ligaments:
+            out += ligament.forces(unknowns)
         fixed = self.space.fixed
         self.reactions = out[fixed]
         out[fixed] = unknowns[fixed] - load.lift[fixed]
@@ -230,25 +235,49 @@ class Forms:
             self._cell_sum.assemble(matrix)
         for springs in self.springs:
             add_matrix(matrix, facet_matrix(springs.stiffness_form, self.space.fixed))
+        for ligament in self.ligaments:
+            ligament.add_to(matrix, unknowns)
         for surface in self._pressed(load):
             add_matrix(matrix, facet_matrix(surface.pressure_tangent, self.space.fixed))
 
     def tangent_times(self, unknowns: Floats, direction: Floats) -> Floats:
         """The stiffness of body and springs times a direction, held unknowns included."""
-        return self._body_tangent_times(unknowns, direction) + self.spring_forces(direction)
+        return self._body_tangent_times(unknowns, direction) + self.supports_times(unknowns, direction)
+
+    def supports_times(self, unknowns: Floats, direction: Floats) -> Floats:
+        """The stiffness of springs and ligaments, symmetric, times a direction."""
+        found = np.zeros(self.space.owned)
+        if self.springs:
+            self.space.set_state(direction)
+            found += self.assembled(*(springs.force_form for springs in self.springs))  # linear
+        for ligament in self.ligaments:
+            found += ligament.stiffness_times(unknowns, direction)
+        return found
 
     def spring_forces(self, unknowns: Floats, name: str = "") -> Floats:
-        """Forces that all springs, or those on a named surface, need to be pulled so far, linear in it."""
+        """Forces that all springs and ligaments, or those of a name, need to be pulled so far."""
+        found = np.zeros(self.space.owned)
         chosen = [springs.force_form for springs in self.springs if name in ("", springs.name)]
-        if not chosen:
-            return np.zeros(self.space.owned)
-        self.space.set_state(unknowns)
-        return self.assembled(*chosen)
+        if chosen:
+            self.space.set_state(unknowns)
+            found += self.assembled(*chosen)
+        for ligament in self.ligaments:
+            if name in ("", ligament.name):
+                found += ligament.forces(unknowns)
+        return found
 
     def set_springs(self, factors: Mapping[str, float]) -> None:
         """How many times as stiff as given the springs on named surfaces are; others as given."""
         for springs in self.springs:
             springs.scale(factors.get(springs.name, 1.0))
+        for ligament in self.ligaments:
+            ligament.scale(factors.get(ligament.name, 1.0))
+
+    @property
+    def spring_factors(self) -> dict[str, float]:
+        """How many times as stiff as given springs and ligaments are, by their names."""
+        factors = {springs.name: springs.factor for springs in self.springs}
+        return factors | {ligament.name: ligament.factor for ligament in self.ligaments}
 
     def _body_tangent_times(self, unknowns: Floats, direction: Floats) -> Floats:
         if self._tangent_action is None:
@@ -267,6 +296,7 @@ class Forms:
         """Strain energy, and that of springs, minus the work of dead forces, joules."""
         stored = self.energy(unknowns)
         stored += sum(scalar(springs.energy_form, self.space.comm) for springs in self.springs)
+        stored += sum(ligament.energy(unknowns) for ligament in self.ligaments)
         return stored - self.space.dot(load.dead, unknowns)
 
     def pressed(self, unknowns: Floats, load: DiscreteLoad) -> Floats:

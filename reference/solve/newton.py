@@ -137,7 +137,9 @@ class Newton:
         """What rounding can be told by; the matrix is the tangent at rest."""
         self._stiffness = float(self.tangent.matrix.norm(PETSc.NormType.NORM_INFINITY))
         nothing = np.zeros(self.space.owned)
-        at_rest = self.space.norm(self.forms.residual(nothing, DiscreteLoad.none(self.space)))
+        stresses = self.forms.internal(nothing)  # what ligaments pull at rest is none of it
+        stresses[self.space.fixed] = 0.0
+        at_rest = self.space.norm(stresses)
         self._round_off = _EPSILONS * at_rest  # what rounding leaves of the stresses of a body at rest
         self._force_noise = force_rounding(self.forms)
         self._energy_noise = _strain_rounding(self.forms) * self.space.body.volume
@@ -182,6 +184,8 @@ class Newton:
 
     def _start_tolerance(self, load: DiscreteLoad) -> None:
         self._scale = self.space.norm(load.dead)
+        for ligament in self.forms.ligaments:
+            self._scale = max(self._scale, self.space.norm(ligament.forces(np.zeros(self.space.owned))))
         if load.pressure:
             pressed = self.forms.residual(np.zeros(self.space.owned), load)
             pressed[self.space.fixed] = 0.0

@@ -16,7 +16,7 @@ from softtwin.meshes.body import Body
 from ..data.loading import Loading
 from ..data.materials import Material
 from ..data.outcome import Equilibrium, NotConverged
-from ..data.springs import Springs
+from ..data.springs import Ligament, Springs, Support
 from ..fem.fenicsx import MPI, assemble_matrix, create_matrix, form, ufl
 from ..fem.forms import DiscreteLoad
 from .continuation import in_load_steps
@@ -25,7 +25,7 @@ from .path import LoadPath
 from .start import Proposal, Starts
 from .system import System
 
-__all__ = ["Loading", "NewtonOptions", "Problem", "Springs"]
+__all__ = ["Ligament", "Loading", "NewtonOptions", "Problem", "Springs"]
 
 Floats = NDArray[np.float64]
 _FIRST_STEP = 0.25  # of the load where the whole load has failed
@@ -49,7 +49,8 @@ class Problem:
         weights: factor of each cell's energy, (cells,), in (0, 1], in place of the body's own fractions.
         quadrature: polynomial degree that the quadrature is exact for; the least that is safe if not given.
         comm: communicator that shares the mesh; each rank on its own if not given.
-        springs: that hold named surfaces (`boundary`: all of it) and give way, beside what is held.
+        springs: that hold named surfaces (`boundary`: all of it) and give way, beside what is held; ligaments by a name
+            of their own.
 
     Raises:
         ValueError: a rigid motion is left, a parameter with another number of cells, a mixed material on linear cells,
@@ -66,7 +67,7 @@ class Problem:
         weights: ArrayLike | None = None,
         quadrature: int | None = None,
         comm: Any = MPI.COMM_SELF,
-        springs: Mapping[str, Springs] | None = None,
+        springs: Mapping[str, Support] | None = None,
     ) -> None:
         self.options = options or NewtonOptions()
         everything = "xyz"[: body.dimension]

@@ -15,7 +15,7 @@ from softtwin.meshes.body import Body
 from ..data.loading import Loading, checked_loading
 from ..data.materials import Material
 from ..data.outcome import Equilibrium
-from ..data.springs import Springs, checked_springs
+from ..data.springs import Support, checked_springs
 from ..fem.discretisation import Discretisation
 from ..fem.forms import DiscreteLoad, Forms
 from .linear import Method
@@ -51,7 +51,7 @@ class System:
         quadrature: int | None,
         method: Method,
         comm: Any,
-        springs: Mapping[str, Springs] | None = None,
+        springs: Mapping[str, Support] | None = None,
     ) -> None:
         if material.is_mixed and body.kind.degree != 2:
             raise ValueError(

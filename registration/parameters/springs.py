@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.inputs import Change, Inputs
-from softtwin.reference.data.materials import Parameter
 
 from .block import Estimate, estimate
 from .factor import Factor
@@ -27,7 +25,7 @@ class SpringStiffness(Factor):
 
     Args:
         deviation: of the factor's logarithm.
-        name: of the surface that they hold.
+        name: of the surface that they hold, or of a ligament.
     """
 
     deviation: float = 1.0
@@ -37,12 +35,6 @@ class SpringStiffness(Factor):
     def stride(self) -> float:
         """Largest change of the factor's logarithm in one step."""
         return float(_STRIDE)
-
-    def check(self, body: Body, parameters: Mapping[str, Parameter]) -> None:
-        """See `InputBlock.check`: a surface of the body."""
-        known = sorted({*body.surfaces, "boundary"})
-        if self.name not in known:
-            raise ValueError(f"SpringStiffness.name: expected a surface among {known}, got {self.name!r}.")
 
     def taken(self, inputs: Inputs, coefficients: Floats, body: Body) -> Inputs:
         """The inputs with these springs at the coefficient."""

@@ -23,7 +23,7 @@ from softtwin.meshes.io import write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
 from softtwin.reference.data.materials import NeoHookean
-from softtwin.reference.data.springs import Springs
+from softtwin.reference.data.springs import Ligament, Springs
 from softtwin.reference.solve.problem import Problem
 
 pytestmark = pytest.mark.fenicsx
@@ -68,7 +68,31 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_configuration_keeps_them(tmp_path: Path) -> None:
     (tmp_path / "organ.toml").write_text(to_toml(config()))
     found, _ = read_config(tmp_path / "organ.toml")
-    assert found.springs.by_name == {"bed": BED}
+    assert found.supports == {"bed": BED}
+
+
+def test_ligaments_are_read_on_the_axes_of_the_files() -> None:
+    given = {**ENTRIES["springs"], "ligaments": {"cord": "1,-2,3cm to 1,-2,30cm"}, "stiffness": {"cord": 40.0}}
+    assert config(springs=given).supports["cord"] == Ligament((0.01, -0.02, 0.03), (0.01, -0.02, 0.3), 40.0)
+    ras = config(springs=given, body={**ENTRIES["body"], "frame": "ras"}).supports["cord"]
+    assert ras == Ligament((-0.01, 0.02, 0.03), (-0.01, 0.02, 0.3), 40.0)
+
+
+def test_a_twin_knows_its_ligament(built: Path, tmp_path: Path) -> None:
+    """The reference and torch, from one configuration."""
+    (tmp_path / "body.vtu").write_bytes((built / "body.vtu").read_bytes())
+    given = {**ENTRIES["springs"], "ligaments": {"cord": "0.4,0.05,0.1 to 0.4,0.05,0.3"}, "stiffness": {"cord": 60.0}}
+    (tmp_path / "organ.toml").write_text(to_toml(config(springs=given)))
+    found = []
+    for model in ("reference", "torch"):
+        with Twin.open(tmp_path, model) as twin:
+            forces = np.zeros_like(twin.body.points)
+            forces[twin.body.node_sets["tool"], 2] = -0.05
+            found.append(twin.predict(forces).displacement)
+    with Twin.open(built / "twin", "reference") as twin:
+        without = twin.predict(forces).displacement
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5 * np.abs(found[0]).max())
+    assert np.abs(found[0] - without).max() > 0.05 * np.abs(without).max()
 
 
 def test_data_and_twin_are_of_a_body_on_springs(built: Path) -> None:
@@ -181,6 +205,10 @@ def test_where_they_are_is_an_input_of_the_mesh(tmp_path: Path) -> None:
         ({"where": {"bed": "x"}, "normal": {"bd": 1.0}}, r"springs\.normal: expected names of springs\.where"),
         ({"where": {"bed": "x"}}, "expected a stiffness above 0"),
         ({"where": {"bed": "x"}, "normal": {"bed": -1.0}}, r"Springs\.normal: expected a stiffness of 0"),
+        ({"ligaments": {"cord": "0,0,0 to 0,0,1"}}, r"springs\.stiffness: expected one for the ligament 'cord'"),
+        ({"ligaments": {"cord": "0,0,0"}, "stiffness": {"cord": 1.0}}, "expected X,Y,Z to X,Y,Z, got '0,0,0'"),
+        ({"ligaments": {"cord": "0,0 to 0,0,1"}, "stiffness": {"cord": 1.0}}, "cord|0,0"),
+        ({"slack": {"cord": 1.0}}, r"springs\.slack: expected names of springs\.ligaments"),
         ({"where": {"observed": "x"}, "normal": {"observed": 1.0}}, "a name of its own, got 'observed'"),
     ],
 )
