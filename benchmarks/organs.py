@@ -37,7 +37,7 @@ from surface_methods import METHODS, Scene
 
 from softtwin.app.chain import build_twin
 from softtwin.app.config import parse_config
-from softtwin.app.twin import Twin
+from softtwin.app.twin import MODEL_ERROR, Twin
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import embed, outer
@@ -131,7 +131,7 @@ def of_liver() -> Iterator[Case]:
 def twin_of(name: str) -> Path:
     """The twin of a simulated organ; one that is there is not built again."""
     folder = RUNS / f"organs-{name.replace(' ', '-')}"
-    if not (folder / "twin" / "surrogate.json").exists():
+    if not (folder / "twin" / MODEL_ERROR).exists():
         build_twin(config_of(name, 900), folder, print)
     return folder / "twin"
 
@@ -152,7 +152,6 @@ def config_of(name: str, nodes: int) -> Any:
             "loads": {"modes": 16, "displacement": 0.03},
             "samples": {"train": 256, "validation": 16, "test": 16, "smooth": 16},
             "training": {"seconds": 120.0},
-            "model_error": {"draws": 0},
         }
     )
 
