@@ -70,7 +70,26 @@ def sequences() -> Any:
     return figure
 
 
-PICTURES = {"hard-loads": hard_loads, "networks": networks, "noise": noise, "sequences": sequences}
+def ways() -> Any:
+    """Errors of all ways to register an organ, theirs and ours, by data."""
+    figures = load("organs")["figures"]
+    data = list(dict.fromkeys(row.split(": ")[0] for row in figures))
+    names = list(dict.fromkeys(row.split(": ")[1] for row in figures))
+    figure, axes = plt.subplots(1, len(data), figsize=(11.0, 3.2), sharey=True)
+    for axis, each in zip(axes, data, strict=True):
+        told = {name: figures[f"{each}: {name}"] for name in names if f"{each}: {name}" in figures}
+        ours = ["surrogate", "hybrid", "reference"]
+        colours = ["teal" if name in ours else "0.65" for name in told]
+        places = [names.index(name) for name in told]
+        axis.barh(places, [row["all_mm"] for row in told.values()], color=colours)
+        axis.set(xscale="log", title=each, xlabel="mean error, mm")
+        axis.set_yticks(range(len(names)), names)
+    axes[0].invert_yaxis()
+    figure.tight_layout()
+    return figure
+
+
+PICTURES = {"hard-loads": hard_loads, "networks": networks, "noise": noise, "sequences": sequences, "ways": ways}
 
 
 def main() -> None:

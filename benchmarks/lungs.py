@@ -1,6 +1,7 @@
 """Measured lungs: landmarks inside at expiration, from the surface at inspiration and a cloud at expiration.
 
     python benchmarks/lungs.py [--only "case 7, right, whole" ...]
+    python benchmarks/lungs.py picture 7 left FILE.png
 
 Five patients of the DIR-Lab COPDgene set (../shared/data/lungs), each lung by itself, one setting for all
 (examples/lung.toml). Each row is what docs/validate.md shows: `softtwin mesh`, then `softtwin evaluate` with the cloud
@@ -144,6 +145,54 @@ def finish(figures: Figures, given: Given) -> Figures:
     return {**figures, "all": {name: found for name, found in lines(figures["lungs"]) if name.startswith("all")}}
 
 
+def picture(case: str, side: str, file: str) -> None:
+    """Draw one lung: both surfaces, and landmarks at expiration with where they were found and their 90 % regions."""
+    import pyvista
+
+    from softtwin.app.twin import Twin
+    from softtwin.meshes.embedding import embed
+
+    folder, _ = prepared(int(case), side)
+    rest, truth = (1e-3 * np.loadtxt(folder / f"landmarks_{name}.txt") for name in ("inspiration", "expiration"))
+    cloud = 1e-3 * np.loadtxt(LUNGS / f"case_{int(case):02d}" / f"cloud_expiration_{SIDES[side]}.txt")
+    with Twin.open(folder / "organ.toml", "reference") as twin:
+        result, carried, body = twin.register(cloud), embed(twin.body, rest), twin.body
+        found = result.pose.apply(rest + carried.displace(result.displacement))
+        margins = result.camera_uncertainty.margin(carried, 0.9)
+    faces = np.column_stack([np.full(len(body.boundary), 3), body.boundary]).ravel()
+    plotter: Any = pyvista.Plotter(off_screen=True, shape=(1, 2), window_size=[1500, 800], border=False)
+    shown = (
+        ("before: inspiration, and landmarks as they lay", body.points, rest, np.full(len(rest), 1e-3)),
+        (
+            "after: registered to expiration, with 90 % regions",
+            result.pose.apply(body.points + result.displacement),
+            found,
+            margins,
+        ),
+    )
+    for column, (title, points, places, radii) in enumerate(shown):
+        plotter.subplot(0, column)
+        plotter.add_mesh(pyvista.PolyData(points, faces), color="#c96f53", opacity=0.25, smooth_shading=True)
+        plotter.add_points(cloud[::10], color="#737373", point_size=2)
+        lines = np.stack([places, truth], axis=1).reshape(-1, 3)
+        plotter.add_mesh(pyvista.line_segments_from_points(lines), color="black", line_width=1.5)
+        plotter.add_points(truth, color="black", point_size=7, render_points_as_spheres=True)
+        plotter.add_points(places, color="#1f4e8c", point_size=7, render_points_as_spheres=True)
+        if column:
+            regions = pyvista.PolyData(places)
+            regions["radius"] = radii
+            ball = pyvista.Sphere(radius=1.0, theta_resolution=16, phi_resolution=12)
+            plotter.add_mesh(regions.glyph(scale="radius", orient=False, geom=ball), color="#1f4e8c", opacity=0.07)
+        plotter.add_text(title, font_size=11, color="black")
+    plotter.link_views()
+    plotter.camera_position = "xz"
+    plotter.reset_camera()
+    plotter.camera.zoom(1.25)
+    plotter.set_background("white")
+    plotter.screenshot(file)
+    plotter.close()
+
+
 BENCHMARK = Benchmark(
     name="lungs",
     title="Lungs in vivo, inspiration to expiration: landmarks inside, whole surface and its lateral half",
@@ -169,4 +218,4 @@ BENCHMARK = Benchmark(
 
 
 if __name__ == "__main__":
-    run(BENCHMARK)
+    run(BENCHMARK, parts={"picture": picture})
