@@ -75,14 +75,14 @@ def ways() -> Any:
     figures = load("organs")["figures"]
     data = list(dict.fromkeys(row.split(": ")[0] for row in figures))
     names = list(dict.fromkeys(row.split(": ")[1] for row in figures))
-    figure, axes = plt.subplots(1, len(data), figsize=(11.0, 3.2), sharey=True)
+    figure, axes = plt.subplots(1, len(data), figsize=(11.0, 3.2), sharex=True, sharey=True)
     for axis, each in zip(axes, data, strict=True):
         told = {name: figures[f"{each}: {name}"] for name in names if f"{each}: {name}" in figures}
         ours = ["surrogate", "hybrid", "reference"]
         colours = ["teal" if name in ours else "0.65" for name in told]
         places = [names.index(name) for name in told]
-        axis.barh(places, [row["all_mm"] for row in told.values()], color=colours)
-        axis.set(xscale="log", title=each, xlabel="mean error, mm")
+        axis.scatter([row["all_mm"] for row in told.values()], places, color=colours, zorder=3)
+        axis.set(xscale="log", xlim=(0.05, 150.0), title=each, xlabel="mean error, mm")
         axis.set_yticks(range(len(names)), names)
     axes[0].invert_yaxis()
     figure.tight_layout()
