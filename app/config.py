@@ -173,8 +173,8 @@ class SpringsSection(Section):
             if len(ends) != 2:
                 raise ValueError(f"springs.ligaments.{name}: expected X,Y,Z to X,Y,Z, got {text!r}")
             sign = -1.0 if is_ras else 1.0
-            place, anchor = ((sign * x, sign * y, z) for x, y, z in (parse_place(end, unit) for end in ends))
-            found[name] = Ligament(place, anchor, self.stiffness[name], self.slack.get(name))
+            place, end = ((sign * x, sign * y, z) for x, y, z in (parse_place(each, unit) for each in ends))
+            found[name] = Ligament(place, end, self.stiffness[name], self.slack.get(name))
         return found
 
 

@@ -7,8 +7,8 @@ Data, read where they lie and copied nowhere: `lungs` (../shared/data/lungs: fiv
 that experts set; made from DIR-Lab COPDgene), whole surface and lateral half; `liver` (../shared/data/liver: sequences
 s1 to s3 of Mestdagh and Cotin 2022, every tenth frame by itself); `surfaces` (../shared/data/surfaces): a liver and a
 kidney as another program wrote them, pulled at a patch that a camera sees by the reference on a finer mesh than the
-twin's, half of the seen side in the cloud, 0.5 mm of noise. Methods without tissue (`surface_methods.py`) get the side
-that is observed and the cloud. Ours get the twin, too: what holds the organ, its material, and on the real liver the
+twin's, half of what is seen in the cloud, 0.5 mm of noise. Methods without tissue (`surface_methods.py`) get the
+observed surface and the cloud. Ours get the twin, too: what holds the organ, its material, and on the real liver the
 zone that tools may touch. Each case is registered from rest.
 
 Places: landmarks in the lungs; elsewhere the nodes of the truth's mesh: on the surface where the cloud is within 8 mm

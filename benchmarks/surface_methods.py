@@ -2,8 +2,8 @@
 
 Rigid and affine iterative closest points (Besl and McKay 1992), coherent point drift (Myronenko and Song 2010, pycpd),
 non-rigid closest points (Amberg et al. 2007, trimesh) and a thin-plate spline through closest points. Each is given
-what registration is given, the observed side at rest and the cloud; places inside are carried by the map itself where
-it is one of space, by a thin-plate spline through the moved vertices where it is one of the surface.
+what registration is given, the observed surface at rest and the cloud; places inside are carried by the map itself
+where it is one of space, by a thin-plate spline through the moved vertices where it is one of the surface.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Scene:
     """What is registered.
 
     Args:
-        surface: the observed side at rest.
+        surface: the observed surface at rest.
         cloud: of it moved, (p, 3), metres.
         shares_frame: whether both are in one frame: then what bends begins where the organ was, else at affine ICP.
         shows_all: whether the cloud shows the whole surface: then closest points are sought both ways, from the place

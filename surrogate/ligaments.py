@@ -30,7 +30,7 @@ class Ligaments(nn.Module):
     nodes: Tensor
     weights: Tensor
     places: Tensor
-    anchors: Tensor
+    ends: Tensor
     moduli: Tensor
     lengths: Tensor
     factors: Tensor
@@ -44,12 +44,12 @@ class Ligaments(nn.Module):
         arrays = {
             "weights": [found.weights[0] for found in carried],
             "places": [each.place for each in every],
-            "anchors": [each.anchor for each in every],
+            "ends": [each.end for each in every],
             "moduli": [each.stiffness for each in every],
             "lengths": [each.length for each in every],
             "factors": [1.0] * len(every),
         }
-        shapes = {"weights": (-1, width), "places": (-1, 3), "anchors": (-1, 3)}
+        shapes = {"weights": (-1, width), "places": (-1, 3), "ends": (-1, 3)}
         for name, values in arrays.items():
             shaped = np.array(values, dtype=np.float64).reshape(shapes.get(name, (-1,)))
             self.register_buffer(name, torch.from_numpy(shaped))
@@ -67,7 +67,7 @@ class Ligaments(nn.Module):
     def _pulled(self, displacement: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Directions (s, l, 3), lengths, stretches and whether they pull, (s, l)."""
         moved = torch.einsum("lk,slki->sli", self.weights, displacement[:, self.nodes])
-        apart = self.places + moved - self.anchors
+        apart = self.places + moved - self.ends
         lengths = torch.linalg.vector_norm(apart, dim=2)
         stretch = lengths - self.lengths
         pulls = stretch >= -_TAUT * lengths

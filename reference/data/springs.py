@@ -53,7 +53,7 @@ class Ligament:
 
     Args:
         place: on or in the organ at rest, (3,), metres; moved by the nodes of its cell.
-        anchor: the other end, (3,), metres.
+        end: the other end, which stays, (3,), metres.
         stiffness: k, N/m.
         slack: l0, metres; the distance of both ends at rest if not given, and less for one that pulls at rest.
 
@@ -63,12 +63,12 @@ class Ligament:
     """
 
     place: tuple[float, float, float]
-    anchor: tuple[float, float, float]
+    end: tuple[float, float, float]
     stiffness: float
     slack: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("place", "anchor"):
+        for name in ("place", "end"):
             values = tuple(map(float, getattr(self, name)))
             if len(values) != 3 or not np.isfinite(values).all():
                 raise ValueError(f"Ligament.{name}: expected three finite coordinates, metres, got {values}.")
@@ -77,21 +77,21 @@ class Ligament:
             raise ValueError(f"Ligament.stiffness: expected more than 0 N/m, got {self.stiffness}.")
         if self.slack is not None and not 0.0 <= self.slack < np.inf:
             raise ValueError(f"Ligament.slack: expected a length of 0 m or more, got {self.slack}.")
-        if self.place == self.anchor:
-            raise ValueError(f"Ligament.anchor: expected another point than the place, got {self.anchor} for both.")
+        if self.place == self.end:
+            raise ValueError(f"Ligament.end: expected another point than the place, got {self.end} for both.")
 
     @property
     def length(self) -> float:
         """Beyond which it pulls, metres."""
-        return float(np.linalg.norm(np.subtract(self.place, self.anchor))) if self.slack is None else self.slack
+        return float(np.linalg.norm(np.subtract(self.place, self.end))) if self.slack is None else self.slack
 
-    def pull(self, moved: Floats) -> tuple[float, Floats, Floats]:
+    def response(self, moved: Floats) -> tuple[float, Floats, Floats]:
         """Energy, J, its gradient, (3,), N, and its second derivative, (3, 3), N/m, where the place has moved.
 
         Args:
             moved: displacement of the place, (3,), metres.
         """
-        apart = np.add(self.place, moved) - self.anchor
+        apart = np.add(self.place, moved) - self.end
         length = float(np.linalg.norm(apart))
         stretch = length - self.length
         if stretch < -_TAUT * length:
@@ -124,7 +124,7 @@ Support = Springs | Ligament
 def springs_of(plan: Mapping[str, Any]) -> dict[str, Support]:
     """The springs in the plan of a data set or of a twin's card, by name."""
     given = plan.get("springs", {}).items()
-    return {name: Ligament(**each) if "anchor" in each else Springs(**each) for name, each in given}
+    return {name: Ligament(**each) if "end" in each else Springs(**each) for name, each in given}
 
 
 def checked_springs(springs: Mapping[str, Support], body: Body) -> dict[str, Support]:

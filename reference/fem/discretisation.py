@@ -282,7 +282,7 @@ def _sprung(body: Body, name: str, springs: Springs, motions: Floats) -> Floats:
 def _tied(body: Body, name: str, ligament: Ligament, motions: Floats) -> Floats:
     """What a ligament resists of rigid motions, (m, 3): all where it pulls at rest, none where it is slack."""
     carried = ligament.carried(name, body)
-    stiffness = ligament.pull(np.zeros(3))[2] / ligament.stiffness
+    stiffness = ligament.response(np.zeros(3))[2] / ligament.stiffness
     return np.asarray(np.einsum("k,mki->mi", carried.weights[0], motions[:, carried.nodes[0]]) @ stiffness)
 
 

@@ -37,7 +37,7 @@ from .ligaments import LigamentForms
 Floats = NDArray[np.float64]
 
 INSIDE_OUT = 1e250  # energy per volume of what is turned inside out, J/m^3; times any cell's volume it is above
-MOST = 1e200  # joules
+LARGEST_ENERGY = 1e200  # joules
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,7 +290,7 @@ class Forms:
         """Strain energy, joules; infinite where a cell is inside out."""
         self.space.set_state(unknowns)
         energy = scalar(self._energy, self.space.comm)
-        return energy if energy < MOST else np.inf
+        return energy if energy < LARGEST_ENERGY else np.inf
 
     def potential(self, unknowns: Floats, load: DiscreteLoad) -> float:
         """Strain energy, and that of springs, minus the work of dead forces, joules."""

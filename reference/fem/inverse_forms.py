@@ -22,7 +22,7 @@ from .fenicsx import (
     scalar,
     ufl,
 )
-from .forms import INSIDE_OUT, MOST, Forms
+from .forms import INSIDE_OUT, LARGEST_ENERGY, Forms
 
 Floats = NDArray[np.float64]
 
@@ -127,7 +127,7 @@ class InverseForms:
         """Out-of-balance forces, newtons; at held unknowns their distance from where they should be; NaN inside out."""
         space, share = self.space, float(self._share.value)
         space.set_state(unknowns)
-        if not scalar(self._energy, space.comm) < MOST:
+        if not scalar(self._energy, space.comm) < LARGEST_ENERGY:
             return np.full(space.owned, np.nan)
         assemble_vector(self._vector, self._residual)
         out = np.array(self._vector.array_r) - share * self._nodal

@@ -40,23 +40,23 @@ class LigamentForms:
         """So many times as stiff as it was given."""
         self.factor = factor
 
-    def _pull(self, unknowns: Floats) -> tuple[float, Floats, Floats]:
-        return self._ligament.pull(self._weights @ unknowns[self._numbers])
+    def _response(self, unknowns: Floats) -> tuple[float, Floats, Floats]:
+        return self._ligament.response(self._weights @ unknowns[self._numbers])
 
     def energy(self, unknowns: Floats) -> float:
         """Stored, joules."""
-        return self.factor * self._pull(unknowns)[0]
+        return self.factor * self._response(unknowns)[0]
 
     def forces(self, unknowns: Floats) -> Floats:
         """That it needs to be as it is, newtons."""
         out = np.zeros(self._space.owned)
-        np.add.at(out, self._numbers, self.factor * self._weights[:, None] * self._pull(unknowns)[1])
+        np.add.at(out, self._numbers, self.factor * self._weights[:, None] * self._response(unknowns)[1])
         return out
 
     def stiffness_times(self, unknowns: Floats, direction: Floats) -> Floats:
         """Derivative of the forces in a direction."""
         out = np.zeros(self._space.owned)
-        pulled = self._pull(unknowns)[2] @ (self._weights @ direction[self._numbers])
+        pulled = self._response(unknowns)[2] @ (self._weights @ direction[self._numbers])
         np.add.at(out, self._numbers, self.factor * self._weights[:, None] * pulled)
         return out
 
@@ -64,7 +64,7 @@ class LigamentForms:
         """Add the stiffness to a matrix, held rows and columns left out."""
         is_free = ~np.isin(self._numbers, self._space.fixed)
         spread = (self._weights[:, None, None] * np.eye(3) * is_free[:, :, None]).reshape(-1, 3)
-        block = self.factor * spread @ self._pull(unknowns)[2] @ spread.T
+        block = self.factor * spread @ self._response(unknowns)[2] @ spread.T
         numbers = self._numbers.ravel().astype(PETSc.IntType)
         matrix.setValues(numbers, numbers, block, addv=PETSc.InsertMode.ADD_VALUES)
         matrix.assemble()

@@ -419,6 +419,7 @@ def test_every_option_reaches_the_registrar(capsys, mesh_folder: Path, mesh_clou
     register(capsys, mesh_folder, mesh_cloud, *flags, "--noise-known", "--format", "ply", "--format", "stl")
     record = record_of(mesh_folder / "found")
     unused = {"forces": "unknown", "parameters": [], "known_forces": "", "gravity": [0.0, 0.0, 0.0], "pressure": 0.0}
+    unused |= {"scan_gravity": [0.0, 0.0, 0.0]}
     unused |= {"distance": "surface", "normals": False, "normal_deviation": 10.0, "budget": 0.0}
     assert record["options"] == {"model": "reference", "noise_known": True, **wanted, **unused}
     assert record["frames"][0]["points"] <= 150

@@ -31,11 +31,11 @@ def pulled(newtons: float) -> Loading:
 
 def test_length_and_pull_are_hookes() -> None:
     cord = Ligament((0.0, 0.0, 0.0), (0.0, 0.0, 0.2), 50.0, slack=0.15)
-    energy, force, stiffness = cord.pull(np.array([0.0, 0.0, -0.1]))
+    energy, force, stiffness = cord.response(np.array([0.0, 0.0, -0.1]))
     assert energy == pytest.approx(0.5 * 50.0 * 0.15**2)
     np.testing.assert_allclose(force, [0.0, 0.0, -50.0 * 0.15])
     np.testing.assert_allclose(stiffness, np.diag([25.0, 25.0, 50.0]))
-    assert cord.pull(np.array([0.0, 0.0, 0.06]))[0] == 0.0
+    assert cord.response(np.array([0.0, 0.0, 0.06]))[0] == 0.0
     assert Ligament((0.0, 0.0, 0.0), (0.0, 3.0, 4.0), 1.0).length == 5.0
 
 
@@ -93,7 +93,7 @@ def test_derivatives_are_those_of_the_states(rng: np.random.Generator) -> None:
 
 
 def test_a_header_keeps_both_kinds() -> None:
-    cord = {"place": [0, 0, 0], "anchor": [0, 0, 1], "stiffness": 2.0, "slack": None}
+    cord = {"place": [0, 0, 0], "end": [0, 0, 1], "stiffness": 2.0, "slack": None}
     assert springs_of({"springs": {"bed": {"normal": 1.0, "tangential": 0.0}, "cord": cord}}) == {
         "bed": Springs(1.0),
         "cord": Ligament((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 2.0),
@@ -103,7 +103,7 @@ def test_a_header_keeps_both_kinds() -> None:
 @pytest.mark.parametrize(
     ("entries", "said"),
     [
-        ({"anchor": TOP}, "expected another point than the place"),
+        ({"end": TOP}, "expected another point than the place"),
         ({"stiffness": 0.0}, "expected more than 0 N/m, got 0"),
         ({"slack": -0.1}, "expected a length of 0 m or more, got -0.1"),
         ({"place": (np.nan, 0.0, 0.0)}, "expected three finite coordinates"),
@@ -111,7 +111,7 @@ def test_a_header_keeps_both_kinds() -> None:
 )
 def test_what_is_none_is_refused(entries: dict, said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        Ligament(**{"place": TOP, "anchor": ABOVE, "stiffness": 1.0, **entries})
+        Ligament(**{"place": TOP, "end": ABOVE, "stiffness": 1.0, **entries})
 
 
 def test_what_does_not_hold_is_refused() -> None:
