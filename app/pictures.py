@@ -138,6 +138,11 @@ def view_of(towards: Floats, points: Iterable[Floats], margin: float = 1.06) -> 
     return View(towards, right, up, centre, (width, height))
 
 
+def sprung(body: Body) -> dict[str, Ints]:
+    """Triangles of the surfaces that springs hold, by name: all that are named but the observed one."""
+    return {name: triangles for name, triangles in body.surfaces.items() if name != "observed"}
+
+
 def camera_side(body: Body) -> Floats:
     """Direction from the body to a camera that sees its observed side, or its broadest side, a little from above."""
     surface = outer(body).rest
@@ -147,7 +152,9 @@ def camera_side(body: Body) -> Floats:
     forward = normals.sum(axis=0)
     if np.linalg.norm(forward) < 0.2 * np.linalg.norm(normals, axis=1).sum():
         _, _, axes = np.linalg.svd(body.points - body.points.mean(axis=0), full_matrices=False)
-        away = body.points.mean(axis=0) - body.points[body.fixed].mean(axis=0)
+        held = [body.fixed, *(triangles.ravel() for name, triangles in sprung(body).items())]
+        nodes = np.concatenate(held)
+        away = body.points.mean(axis=0) - body.points[nodes].mean(axis=0) if len(nodes) else axes[2]
         forward = axes[2] * (1.0 if axes[2] @ away >= 0 else -1.0)
     forward = forward / np.linalg.norm(forward)
     return forward + np.array([0.0, 0.0, 0.3]) + 0.3 * np.cross(forward, [0.0, 0.0, 1.0])

@@ -42,6 +42,7 @@ from .pictures import (
     is_tumour,
     moved_layers,
     rendering_problem,
+    sprung,
     view_of,
 )
 from .record import NOTICE
@@ -208,6 +209,8 @@ def organ_section(space: Workspace, studio: Studio) -> Section:
     colours = inner_colours(body.inner)
     observed = [(OBSERVED, "observed side (mesh lines)")] if "observed" in body.surfaces else []
     inner = [(colours[name], name) for name in body.inner]
+    held = [(FIXED, f"{len(body.fixed)} fixed nodes")] if len(body.fixed) else []
+    held += [(FIXED, f"springs {name} (mesh lines)") for name in sprung(body)]
     front = camera_side(body)
     sides = {
         "from the camera's side": front,
@@ -220,7 +223,7 @@ def organ_section(space: Workspace, studio: Studio) -> Section:
     ]
     return {
         "pictures": pictures,
-        "legend": [(ORGAN, "surface"), *observed, (FIXED, f"{len(body.fixed)} fixed nodes"), *inner],
+        "legend": [(ORGAN, "surface"), *observed, *held, *inner],
         "quality": mesh_quality(body),
         "fixed": len(body.fixed),
         "extent": np.ptp(body.points, axis=0).tolist(),
@@ -237,7 +240,8 @@ def organ_layers(body: Body) -> list[Layer]:
     if "observed" in body.surfaces:
         layers.append(Layer(outside.points, body.surfaces["observed"], OBSERVED, 0.35, style="wireframe"))
     layers += [Layer(surface.points, surface.triangles, colours[name]) for name, surface in body.inner.items()]
-    return [*layers, Layer(body.points[body.fixed], colour=FIXED, ball=0.011)]
+    layers += [Layer(outside.points, each, FIXED, 0.5, style="wireframe") for each in sprung(body).values()]
+    return [*layers, Layer(body.points[body.fixed], colour=FIXED, ball=0.011)] if len(body.fixed) else layers
 
 
 # ------------------------------------------------------------------ modes and data

@@ -14,6 +14,7 @@ pytest.importorskip("torch", reason="torch is absent")
 from softtwin.app.chain import build_twin
 from softtwin.app.config import Config, ConfigError, parse_config, read_config, to_toml
 from softtwin.app.inputs import mesh_inputs
+from softtwin.app.report import report_stage
 from softtwin.app.stages.mesh import mesh_stage
 from softtwin.app.twin import Twin
 from softtwin.app.workspace import Workspace
@@ -109,6 +110,14 @@ def test_data_and_twin_are_of_a_body_on_springs(built: Path) -> None:
         rest = twin.predict(np.zeros_like(forces)).displacement
     assert missed < 0.1 * np.linalg.norm(state, axis=1).mean()
     assert not rest.any()
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_the_report_shows_what_holds_it(built: Path) -> None:
+    """Without a fixed node there is nothing to look away from."""
+    page = report_stage(Workspace(config(), built), ()).read_text()
+    assert "springs bed (mesh lines)" in page
+    assert "0 fixed nodes" not in page
 
 
 def test_all_engines_register_it(built: Path) -> None:
