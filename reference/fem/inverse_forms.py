@@ -22,7 +22,7 @@ from .fenicsx import (
     scalar,
     ufl,
 )
-from .forms import INSIDE_OUT, LARGEST_ENERGY, Forms
+from .forms import INSIDE_OUT, LARGEST_ENERGY, Forms, deformed_area
 
 Floats = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class InverseForms:
         test, _ = self._forms.split(self._test)
         parts = []
         for springs in self._forms.springs:
-            area = self._unloaded_area(f)
+            area = deformed_area(self.space, None, f)
             size = ufl.sqrt(ufl.inner(area, area))
             across = ufl.inner(U, area) / size * area / size
             parts.append(
@@ -86,7 +86,7 @@ class InverseForms:
     def _tractions(self, f: Any, loading: Loading) -> list[Any]:
         """Dead tractions, which are given per unloaded area."""
         test, _ = self._forms.split(self._test)
-        area = self._unloaded_area(f)
+        area = deformed_area(self.space, None, f)
         size = ufl.sqrt(ufl.inner(area, area))
         return [
             -self._share * ufl.inner(self._vector_of(given), test) * size * self._forms.surface(name).ds
@@ -112,12 +112,6 @@ class InverseForms:
 
     def _vector_of(self, values: ArrayLike) -> Any:
         return fem.Constant(self.space.mesh, np.array(values, dtype=np.float64))
-
-    def _unloaded_area(self, f: Any) -> Any:
-        """Area vector before the load per area after it, cof(f) n, in UFL."""
-        cofactor, normal = ufl.det(f) * ufl.inv(f).T, ufl.FacetNormal(self.space.mesh)
-        dimension = self.space.body.dimension
-        return ufl.as_vector([sum(cofactor[i, j] * normal[j] for j in range(dimension)) for i in range(dimension)])
 
     def set_share(self, share: float) -> None:
         """Which part of the load acts."""
