@@ -288,9 +288,9 @@ class TrainingSection(Section):
 
     group: ClassVar[str] = "training"
 
-    architecture: Literal["reduced", "mlp", "umesh", "transolver"] = option(
+    architecture: Literal["reduced", "galerkin", "mlp", "umesh", "transolver"] = option(
         "reduced",
-        "reduced network; as yardsticks the thesis's perceptron (mlp) and U-Mesh (umesh, on a regular grid), and a "
+        "reduced network, or galerkin, equilibria in the span of a few modes, which learns nothing; as yardsticks the thesis's perceptron (mlp) and U-Mesh (umesh, on a regular grid), and a "
         "transolver",
     )
     modes: int = option(64, "displacement modes (POD) of the reduced network", ge=1)

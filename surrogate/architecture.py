@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -37,9 +38,18 @@ class Network(nn.Module):
     Its derivatives come from torch.func, unless it brings its own because they were measured to pay.
     """
 
-    def linearised(self, coordinates: Tensor) -> Linearisation:
-        """The network at one point, (d,)."""
+    def linearised(self, coordinates: Tensor, near: Linearisation | None = None) -> Linearisation:
+        """The network at one point, (d,).
+
+        Args:
+            coordinates: the point.
+            near: the network at a point nearby, for those that look for their values and find them sooner so.
+        """
         return Differentiated(self, coordinates)
+
+    def rounded(self) -> Network:
+        """The same, good to six digits, and faster."""
+        return copy.deepcopy(self).float()
 
 
 class Differentiated:
@@ -112,10 +122,6 @@ class Architecture(Protocol):
     """A kind of network with its settings: a frozen dataclass whose fields are its part of the configuration."""
 
     name: ClassVar[str]
-    rate: ClassVar[float]
-    """Learning rate, where a plan says none."""
-    batch: ClassVar[int]
-    """Samples a step, where a plan says none."""
 
     def check(self, body: Body) -> None:
         """Refuse a body that it cannot learn on, before equilibria are solved for it.
@@ -124,12 +130,29 @@ class Architecture(Protocol):
             ValueError: what is wrong with the body.
         """
 
+    @staticmethod
+    def from_state_dict(tensors: Mapping[str, Tensor]) -> Network:
+        """The predicting network from what its `state_dict` was."""
+
+
+class TrainedArchitecture(Architecture, Protocol):
+    """One whose weights are found step by step."""
+
+    rate: ClassVar[float]
+    """Learning rate, where a plan says none."""
+    batch: ClassVar[int]
+    """Samples a step, where a plan says none."""
+
     def objective(self, data: DataSet, train: Samples, validation: Samples) -> Any:
         """A `TrainingObjective` with fresh weights."""
 
     def optimizer(self, network: Any, rate: float) -> torch.optim.Optimizer:
         """What trains the lesson's network; its rate is set before every step."""
 
-    @staticmethod
-    def from_state_dict(tensors: Mapping[str, Tensor]) -> Network:
-        """The predicting network from what its `state_dict` was."""
+
+@runtime_checkable
+class FittedArchitecture(Architecture, Protocol):
+    """One that is made at once, from the body and a few equilibria."""
+
+    def fitted(self, data: DataSet, train: Samples) -> tuple[LinearEncoderDecoder, Network]:
+        """The linear maps around the network, and the network, which is ready."""

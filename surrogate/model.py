@@ -33,16 +33,19 @@ class SurrogateState:
         surrogate: the surrogate.
         coordinates: of the load, that the network takes, (d,).
         linear: linear part of the displacement, (3n,), metres.
+        near: the network at a load nearby, if one is known.
     """
 
     negative_pivots: int | None = None  # a network has no tangent to count them of
 
-    def __init__(self, surrogate: Surrogate, coordinates: Floats, linear: Floats) -> None:
+    def __init__(
+        self, surrogate: Surrogate, coordinates: Floats, linear: Floats, near: Linearisation | None = None
+    ) -> None:
         encoder_decoder = surrogate.encoder_decoder
         self._surrogate, self.coordinates = surrogate, coordinates
-        self._inner = surrogate.network.linearised(torch.from_numpy(coordinates))
+        self.inner = surrogate.network.linearised(torch.from_numpy(coordinates), near)
         self.displacement: Floats = (
-            encoder_decoder.offset + linear + encoder_decoder.decoded(self._inner.values.numpy())
+            encoder_decoder.offset + linear + encoder_decoder.decoded(self.inner.values.numpy())
         ).reshape(-1, 3)
 
     @property
@@ -82,7 +85,7 @@ class SurrogateState:
             ValueError: another shape, numbers that are not finite, or changes at nodes that never carry load.
         """
         linear, encoded = self._surrogate.linear_jvp(changes)
-        return linear + self._surrogate.encoder_decoder.decoded(tangent(self._inner, encoded))
+        return linear + self._surrogate.encoder_decoder.decoded(tangent(self.inner, encoded))
 
     def vjp(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3): J^T g, zero at nodes that never carry load.
@@ -99,7 +102,7 @@ class SurrogateState:
         encoder_decoder = self._surrogate.encoder_decoder
         flat = checked_array("SurrogateState.cotangent", given, shape).ravel()
         gradient = np.zeros_like(flat)
-        inner = self._inner.vjp(torch.from_numpy(encoder_decoder.decoded_adjoint(flat))).numpy()
+        inner = self.inner.vjp(torch.from_numpy(encoder_decoder.decoded_adjoint(flat))).numpy()
         gradient[self._surrogate.rows] = encoder_decoder.linear_adjoint(flat) + encoder_decoder.encoded_adjoint(inner)
         return gradient.reshape(-1, 3)
 
@@ -133,7 +136,7 @@ class Surrogate:
     @cached_property
     def single(self) -> Network:
         """The network in single precision: good to 1e-6, in half of the time."""
-        return copy.deepcopy(self.network).float()
+        return self.network.rounded()
 
     @property
     def error(self) -> float:
@@ -174,7 +177,7 @@ class Surrogate:
 
         Args:
             forces: nodal forces, (n, 3), newtons.
-            near: of no use here; a network needs no start.
+            near: a state of this surrogate under a load nearby; networks that look for their values begin there.
 
         Raises:
             ValueError: another shape, numbers that are not finite, or forces at nodes that the surrogate never saw
@@ -183,7 +186,8 @@ class Surrogate:
         load = checked_array("Surrogate.forces", forces, self.body.points.shape)
         self._refuse_idle("forces", np.abs(load).max(axis=1))
         loads = load.ravel()[self.rows]
-        return SurrogateState(self, self.encoder_decoder.encoded(loads), self.encoder_decoder.linear(loads))
+        start = near.inner if isinstance(near, SurrogateState) else None
+        return SurrogateState(self, self.encoder_decoder.encoded(loads), self.encoder_decoder.linear(loads), start)
 
     def propose(self, forces: ArrayLike, linear: Floats | None = None) -> Floats:
         """The displacement alone, (n, 3), metres, in single precision and half of the time: for Newton to start from.
@@ -301,14 +305,15 @@ class ReducedSurrogateState:
     Args:
         model: the reduced surrogate.
         coefficients: (k,).
+        near: the network at coefficients nearby, if it is known.
     """
 
-    def __init__(self, model: ReducedSurrogate, coefficients: Floats) -> None:
+    def __init__(self, model: ReducedSurrogate, coefficients: Floats, near: Linearisation | None = None) -> None:
         self.model, self.coefficients = model, coefficients
         coordinates = (model.encode @ coefficients).astype(np.float32)
-        self._inner = model.surrogate.single.linearised(torch.from_numpy(coordinates))
+        self.inner = model.surrogate.single.linearised(torch.from_numpy(coordinates), near)
         moved = model.offset_rows + model.rows @ np.concatenate(
-            [coefficients, self._inner.values.numpy()[model.wanted]]
+            [coefficients, self.inner.values.numpy()[model.wanted]]
         )
         self.positions: Floats = moved.reshape(-1, 3)
 
@@ -317,11 +322,11 @@ class ReducedSurrogateState:
         """The whole state, in double precision."""
         model = self.model
         coordinates = model.encode @ self.coefficients
-        return SurrogateState(model.surrogate, coordinates, model.linear(self.coefficients))
+        return SurrogateState(model.surrogate, coordinates, model.linear(self.coefficients), self.inner)
 
     @cached_property
     def _tangent(self) -> Floats:
-        return tangent(self._inner, self.model.encode)[self.model.wanted]
+        return tangent(self.inner, self.model.encode)[self.model.wanted]
 
     def jacobian(self, rows: csr_array) -> Floats:
         """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p); no more is touched."""
@@ -394,4 +399,4 @@ class ReducedSurrogate:
             raise ValueError(f"coefficients: expected shape ({self.encode.shape[1]},), got {c.shape}.")
         if isinstance(near, ReducedSurrogateState) and near.model is self and np.array_equal(near.coefficients, c):
             return near
-        return ReducedSurrogateState(self, c)
+        return ReducedSurrogateState(self, c, near.inner if isinstance(near, ReducedSurrogateState) else None)

@@ -21,7 +21,7 @@ from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, LinearResponse, Samples, probe_cotangents
 from softtwin.reference.data.jacobians import Jacobians, read_jacobians
 
-from .architecture import Network
+from .architecture import Linearisation, Network
 from .encoder_decoder import LinearEncoderDecoder, response_parts
 from .optimizers import MuonWithAdamW
 from .pod import ReducedBasis, basis_of, learned_basis, semi_relative, sizes_of
@@ -183,7 +183,7 @@ class AveragedNetwork(ReducedNetwork):
         values = super().forward(turned.reshape(-1, modes)).reshape(count, -1, modes)
         return torch.einsum("gij,gsi->sj", self.turns, values) / count
 
-    def linearised(self, coordinates: Tensor) -> LinearisedAverage:
+    def linearised(self, coordinates: Tensor, near: Linearisation | None = None) -> LinearisedAverage:
         """The network at one point, (r,)."""
         return LinearisedAverage(self, coordinates)
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from .architecture import Architecture
+from .galerkin import Galerkin
 from .mlp import Perceptron
 from .reduced import Reduced
 from .transolver import Transolver
 from .umesh import UMesh
 
-ARCHITECTURES: dict[str, type[Architecture]] = {kind.name: kind for kind in (Reduced, Perceptron, UMesh, Transolver)}
+ARCHITECTURES: dict[str, type[Architecture]] = {kind.name: kind for kind in (Reduced, Galerkin, Perceptron, UMesh, Transolver)}

@@ -13,9 +13,11 @@ import lightning
 import numpy as np
 import torch
 
+from softtwin.meshes.metrics import relative_error
 from softtwin.reference.data.dataset import DataSet, Samples
 from softtwin.reference.data.schema import Reason
 
+from .architecture import FittedArchitecture
 from .checkpoint import CHECKPOINT, fingerprint, read_checkpoint
 from .model import Surrogate
 from .physics import with_physics
@@ -50,6 +52,8 @@ def train(
     for name, samples in splits.items():
         _check_split(data, name, samples)
     mark = fingerprint(data, splits)
+    if isinstance(plan.architecture, FittedArchitecture):
+        return _fitted(data, plan, splits, mark, clock)
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(folder or temporary) / CHECKPOINT
         resumed = read_checkpoint(path, plan, mark) if path.exists() else None
@@ -63,9 +67,43 @@ def train(
         if training_module.share < 1.0:
             fit(training_module, path, resumed is not None, log=folder is not None)
     objective.network.load_state_dict(training_module.best)
-    return Surrogate(
-        data.body, objective.encoder_decoder(), objective.trained(), _card(data, plan, splits, training_module)
-    )
+    training = {
+        "parameters": sum(p.numel() for p in training_module.objective.network.parameters()),
+        "steps": training_module.steps_made,
+        "seconds": training_module.seconds,
+        "validation_error": training_module.best_error,
+        "device": where,
+        "versions": {"torch": torch.__version__, "lightning": lightning.__version__},
+    }
+    card = _card(data, plan, splits, mark, training)
+    return Surrogate(data.body, objective.encoder_decoder(), objective.trained(), card)
+
+
+def _fitted(
+    data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], mark: str, clock: Callable[[], float]
+) -> Surrogate:
+    """The surrogate of an architecture that is made at once."""
+    assert isinstance(plan.architecture, FittedArchitecture)
+    if plan.physics is not None:
+        raise ValueError(f"train.plan: expected no physics in the loss of {plan.architecture.name}, which has no loss.")
+    begin = clock()
+    encoder_decoder, network = plan.architecture.fitted(data, splits["train"])
+    training = {
+        "parameters": sum(values.numel() for values in network.buffers()),
+        "steps": 0,
+        "seconds": clock() - begin,
+        "device": "cpu",
+        "versions": {"torch": torch.__version__},
+    }
+    surrogate = Surrogate(data.body, encoder_decoder, network, _card(data, plan, splits, mark, training))
+    found = relative_error(_predicted(surrogate, data, splits["validation"]), splits["validation"].displacements)
+    return surrogate.with_card(training={**training, "validation_error": float(np.median(found))})
+
+
+def _predicted(surrogate: Surrogate, data: DataSet, samples: Samples) -> Any:
+    forces = np.zeros((len(samples), *data.body.points.shape))
+    forces[:, data.response.loaded] = samples.forces
+    return np.stack([surrogate.solve(load).displacement for load in forces])
 
 
 def _check_split(data: DataSet, name: str, samples: Samples) -> None:
@@ -81,7 +119,7 @@ def _check_split(data: DataSet, name: str, samples: Samples) -> None:
 
 
 def _card(
-    data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], training_module: TrainingModule
+    data: DataSet, plan: TrainingPlan, splits: dict[str, Samples], mark: str, training: dict[str, Any]
 ) -> dict[str, Any]:
     train_split = splits["train"]
     reasons = data.figures("train")["reason"][: plan.samples]
@@ -91,21 +129,14 @@ def _card(
         "plan": plan.entries(),
         "data": {
             "path": str(data.path),
-            "fingerprint": training_module.mark,
+            "fingerprint": mark,
             "identity": data.identity,
             "versions": data.header.get("versions", {}),
             "plan": data.header.get("plan", {}),
             **{name: data.header[name] for name in ("merged",) if name in data.header},
         },
         "samples": {**{name: len(samples) for name, samples in splits.items()}, "rejected": dict(rejected)},
-        "training": {
-            "parameters": sum(p.numel() for p in training_module.objective.network.parameters()),
-            "steps": training_module.steps_made,
-            "seconds": training_module.seconds,
-            "validation_error": training_module.best_error,
-            "device": chosen_device(plan),
-            "versions": {"torch": torch.__version__, "lightning": lightning.__version__},
-        },
+        "training": training,
         "domain": {
             "largest_displacement_m": _peak(train_split.displacements),
             "largest_nodal_force_n": _peak(train_split.forces),

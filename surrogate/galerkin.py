@@ -1,0 +1,229 @@
+"""The Galerkin model's basis: modes of typical loads, their modal derivatives, and what own equilibria add to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from softtwin.meshes.body import Body
+from softtwin.reference.data.dataset import DataSet, Samples, stored_plans
+from softtwin.reference.data.materials import MATERIALS
+from softtwin.reference.data.samplers import LoadPlan, draw_load, draw_smooth_load
+from softtwin.reference.data.springs import ligaments_of
+
+from .cubature import sparse_weights
+from .encoder_decoder import LinearEncoderDecoder, response_parts
+from .modal_derivatives import FactoredTangent, leading_modes, modal_derivatives, without
+from .reduced_equilibria import GalerkinNetwork
+from .residual import ElasticBody
+from .tangents import layers_of
+from .warping import Warping
+
+Floats = NDArray[np.float64]
+_LOADS = 256  # typical loads, that nothing is solved for but linear responses
+_LEAST_SHARE = 0.2  # of the usual top, that the smallest of them are
+_STATES = 48  # of typical loads, that the cells are chosen by
+_SKETCH = 2000  # combinations of what the cells are chosen by (Johnson and Lindenstrauss 1984)
+_OWN = 32  # equilibria, at most, that the basis is told of
+
+
+@dataclass(frozen=True)
+class Galerkin:
+    """The Galerkin model's settings: equilibria in the span of a few modes, by a few cells. Nothing is trained.
+
+    Args:
+        modes: linear modes of typical loads.
+        curved: so many of them, the first, have modal derivatives.
+        derivatives: modes of these that are kept.
+        own: modes of what the equilibria of the training split, and their tangents, add; 0 leaves them out.
+        cells: that stand for the body, about.
+        tolerance: of internal forces by these cells, relative, below which no more are taken.
+
+    Raises:
+        ValueError: an argument out of its range.
+    """
+
+    modes: int = 24
+    curved: int = 16
+    derivatives: int = 48
+    own: int = 24
+    cells: int = 400
+    tolerance: float = 0.005
+
+    name: ClassVar[str] = "galerkin"
+
+    def __post_init__(self) -> None:
+        for name in ("modes", "curved", "cells"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"Galerkin.{name}: expected at least 1, got {getattr(self, name)}.")
+        for name in ("derivatives", "own"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"Galerkin.{name}: expected at least 0, got {getattr(self, name)}.")
+        if not 0.0 < self.tolerance < 1.0:
+            raise ValueError(f"Galerkin.tolerance: expected a number between 0 and 1, got {self.tolerance}.")
+
+    def check(self, body: Body) -> None:
+        """Any body in space will do.
+
+        Raises:
+            ValueError: a plane body.
+        """
+        if body.dimension != 3:
+            raise ValueError(f"Galerkin.body: expected a body in space, got one of {body.dimension} dimensions.")
+
+    def fitted(self, data: DataSet, train: Samples) -> tuple[LinearEncoderDecoder, GalerkinNetwork]:
+        """The maps around the network, and the network, which is ready.
+
+        Args:
+            data: for body, material, linear response and how loads are drawn.
+            train: equilibria that are known.
+
+        Raises:
+            ValueError: a law that is not one of `MATERIALS`, or ligaments, whose forces no cell carries.
+        """
+        law = _law_of(data)
+        if ligaments_of(data.springs):
+            raise ValueError(
+                f"Galerkin.data: expected springs on surfaces alone, got the ligaments {sorted(ligaments_of(data.springs))}; "
+                "learn a network (architecture reduced), or register with --model torch or reference."
+            )
+        elastic = ElasticBody(data.body, data.material, springs=data.springs)
+        tangent = FactoredTangent(elastic)
+        linear = tangent.inverse(_spread(data, typical_loads(data, train)).T).T
+        basis = self.basis(tangent, linear, train.displacements[:_OWN])
+        network = self._network(law, elastic, basis, linear, train.displacements[:_OWN], data.body.size)
+        left, right = response_parts(data.response)
+        at_loaded = basis.reshape(-1, 3, basis.shape[1])[data.response.loaded].reshape(-1, basis.shape[1])
+        encode = np.ascontiguousarray(at_loaded.T)
+        return LinearEncoderDecoder(data.response.loaded, np.zeros(len(left)), left, right, encode, basis), network
+
+    def basis(self, tangent: FactoredTangent, linear: Floats, own: Floats) -> Floats:
+        """Orthonormal displacements, (3n, r).
+
+        Args:
+            tangent: of the body at rest.
+            linear: responses to typical loads, (m, 3n), metres.
+            own: equilibria, (s, n, 3), metres.
+        """
+        sizes = np.linalg.norm(linear, axis=1, keepdims=True)
+        modes = leading_modes(linear / np.sqrt(np.maximum(sizes, 1e-300)), self.modes)
+        spread = np.sqrt(np.square(linear @ modes).mean(axis=0))
+        curved = modal_derivatives(tangent, modes[:, : self.curved] * spread[: self.curved])
+        found = _joined(modes, leading_modes(without(curved, modes), self.derivatives))
+        if self.own and len(own):
+            added = [without(fields, found) for fields in self._own_fields(tangent, modes * spread, own)]
+            scaled = [fields / max(float(np.linalg.norm(fields)), 1e-300) for fields in added]
+            found = _joined(found, leading_modes(np.concatenate(scaled), self.own))
+        return found
+
+    def _own_fields(self, tangent: FactoredTangent, modes: Floats, own: Floats) -> tuple[Floats, Floats]:
+        """Equilibria, (s, 3n), and small changes of them under the forces of linear modes, (m, 3n)."""
+        flat = own.reshape(len(own), -1)
+        scale = 1.0 / np.sqrt(np.maximum(np.linalg.norm(flat, axis=1), 1e-300))
+        at_rest = tangent.elastic.stiffness(torch.zeros(tangent.elastic.nodes, 3, dtype=torch.float64))
+        forces = at_rest @ modes[:, : self.curved]
+        changes = [FactoredTangent(tangent.elastic, state).inverse(forces).T for state in own]
+        return flat * scale[:, None], np.concatenate(changes)
+
+    def _network(self, law: str, elastic: ElasticBody, basis: Floats, linear: Floats, own: Floats, extent: float) -> GalerkinNetwork:
+        size = basis.shape[1]
+        nodal = torch.from_numpy(basis.reshape(-1, 3, size))[elastic.cells]
+        slopes = torch.einsum("ckir,cqkj->cqijr", nodal, elastic.gradients).reshape(-1, 9, size)
+        weights = elastic.volumes.reshape(-1)
+        points = elastic.volumes.shape[1]
+        parameters = {
+            name: getattr(elastic, f"parameter_{name}").expand(len(elastic.volumes), points).reshape(-1)
+            for name in elastic.material.parameters
+        }
+        whole = GalerkinNetwork(law, parameters, slopes, weights, _support(elastic, basis))
+        states = np.concatenate([_warped(elastic, linear, extent), own.reshape(len(own), -1)])
+        shares = np.concatenate([whole.shares(torch.from_numpy(state @ basis)) for state in states])
+        if len(shares) > _SKETCH:
+            signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_SKETCH, len(shares)))
+            shares = signs @ shares / np.sqrt(_SKETCH)
+        taken, factors, _ = sparse_weights(shares, self.tolerance, self.cells)
+        chosen = torch.from_numpy(taken)
+        own_parameters = {name: values[chosen] for name, values in parameters.items()}
+        return GalerkinNetwork(
+            law, own_parameters, slopes[chosen], weights[chosen] * torch.from_numpy(factors), whole.support
+        )
+
+    @staticmethod
+    def from_state_dict(tensors: Mapping[str, Tensor]) -> GalerkinNetwork:
+        """The network from what its `state_dict` was."""
+        return GalerkinNetwork.from_state_dict(tensors)
+
+
+def typical_loads(data: DataSet, train: Samples) -> Floats:
+    """Forces at the loaded nodes, (m, l, 3), newtons, as they are drawn and as registration expects them.
+
+    Sizes are those of the training draws by their linear response. Where the data set does not say how loads are drawn
+    they are those of the training.
+
+    Args:
+        data: the data set.
+        train: its training samples.
+    """
+    plans = stored_plans(data.header, "train")
+    if not plans or not plans[0].get("loads"):
+        return train.forces[:_LOADS]
+    entries = plans[0]["loads"]
+    plan = LoadPlan(**{**entries, "zones": tuple(entries["zones"]), "radius": tuple(entries["radius"])})
+    known = data.response.apply(train.forces[:_LOADS])
+    top = float(np.linalg.norm(known, axis=2).max(axis=1).max())
+    found = []
+    for number in range(_LOADS):
+        rng = np.random.default_rng([0, number])
+        if number % 2:
+            load = draw_smooth_load(data.body, plan, rng)
+        else:
+            load = draw_load(data.body, data.shapes, plan, rng)
+        at_loaded = load[data.response.loaded]
+        peak = float(np.linalg.norm(data.response.apply(at_loaded[None])[0], axis=1).max())
+        found.append(at_loaded * (rng.uniform(_LEAST_SHARE, 1.0) * top / max(peak, 1e-300)))
+    return np.stack(found)
+
+
+def _law_of(data: DataSet) -> str:
+    for name, kind in MATERIALS.items():
+        if type(data.material) is kind and not data.material.is_mixed:
+            return name
+    raise ValueError(
+        f"Galerkin.data: expected a law among {sorted(MATERIALS)}, got {type(data.material).__name__}."
+    )
+
+
+def _spread(data: DataSet, forces: Floats) -> Floats:
+    """Forces at all nodes, (m, 3n)."""
+    whole = np.zeros((len(forces), len(data.body.points), 3))
+    whole[:, data.response.loaded] = forces
+    return whole.reshape(len(forces), -1)
+
+
+def _joined(modes: Floats, more: Floats) -> Floats:
+    return np.linalg.qr(np.hstack([modes, more]))[0]
+
+
+def _support(elastic: ElasticBody, basis: Floats) -> Tensor:
+    """Stiffness of the springs between modes, (r, r), N/m."""
+    size = basis.shape[1]
+    if not len(elastic.sprung):
+        return torch.zeros(size, size, dtype=torch.float64)
+    nodal = torch.from_numpy(basis.reshape(-1, 3, size))[elastic.cells[elastic.sprung]].flatten(1, 2)
+    return torch.einsum("cir,cij,cjs->rs", nodal, elastic.spring_stiffness, nodal)
+
+
+def _warped(elastic: ElasticBody, linear: Floats, size: float) -> Floats:
+    """Typical displacements, (m, 3n): linear responses with their turns made finite."""
+    some = linear[np.linspace(0, len(linear) - 1, min(_STATES, len(linear))).astype(int)]
+    if elastic.material.is_linear:
+        return some
+    layers = layers_of(elastic.cells.numpy(), elastic.free[:, 0].numpy() > 0.0)
+    warped = Warping(elastic, layers, size).warped(torch.from_numpy(some.reshape(len(some), -1, 3)))
+    return warped.reshape(len(some), -1).numpy()

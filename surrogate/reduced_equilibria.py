@@ -1,0 +1,285 @@
+"""Equilibria among the displacements that a few modes span, by a few weighted cells: Galerkin's method, hyper-reduced.
+
+To whoever asks it is a network: coordinates of the load in, coordinates of the displacement out, with derivatives by
+the implicit function theorem. `galerkin` chooses modes and cells.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from functools import cached_property
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from softtwin.reference.data.materials import MATERIALS, Material
+from softtwin.reference.data.outcome import NotConverged
+
+from .algebra import TorchAlgebra
+from .architecture import Linearisation, Network
+from .jets import Jet, JetAlgebra
+
+Floats = NDArray[np.float64]
+_PARAMETER = "parameter_"
+_TOLERANCE, _ROUGH = 1e-10, 1e-6  # out-of-balance forces relative to the load's, exact and rounded
+_ITERATIONS = 60
+_DESCENT = 1e-4  # of what the slope promises
+_SHORTEST = 1e-6
+_FAST = 0.1  # by which out-of-balance forces are to fall in a step, or the tangent is made anew
+_SHIFTS = tuple(0.01 * 4.0**i for i in range(12))  # of the stiffness at rest, added to a tangent that is indefinite
+_LEAST_JACOBIAN = 0.1  # in any cell of a state that cells are chosen by
+_EPSILONS = 8.0  # of machine precision, by which sums that cancel are off
+
+
+class GalerkinNetwork(Network):
+    """Correction to the linear response, (s, r), metres, from coordinates of the load, (s, r), newtons.
+
+    Args:
+        law: name of the strain energy, one of `MATERIALS`.
+        parameters: of the law, by name, one for each cell that is taken, (p,), or one for all, (1,).
+        slopes: gradients of the modes in the cells that are taken, (p, 9, r), 1/m.
+        weights: volume that each of them stands for, (p,), m^3.
+        support: stiffness of what holds the body and gives way, between modes, (r, r), N/m.
+    """
+
+    slopes: Tensor
+    weights: Tensor
+    support: Tensor
+    law: Tensor
+    at_rest: Tensor
+
+    def __init__(
+        self, law: str, parameters: Mapping[str, Tensor], slopes: Tensor, weights: Tensor, support: Tensor
+    ) -> None:
+        super().__init__()
+        self.register_buffer("slopes", slopes.contiguous())
+        self.register_buffer("weights", weights)
+        self.register_buffer("support", support)
+        self.register_buffer("law", torch.tensor(list(law.encode()), dtype=torch.uint8))
+        for name, values in parameters.items():
+            self.register_buffer(f"{_PARAMETER}{name}", values)
+        self.is_exact = True
+        self.register_buffer("at_rest", self.stiffness(torch.zeros_like(slopes[0, 0])))
+
+    @property
+    def parameters_of_law(self) -> dict[str, Tensor]:
+        """By name, (p,) or (1,)."""
+        return {n.removeprefix(_PARAMETER): values for n, values in self.named_buffers() if n.startswith(_PARAMETER)}
+
+    def rounded(self) -> GalerkinNetwork:
+        """The same, good to six digits and faster: forces in double precision, tangents in single."""
+        other = copy.copy(self)
+        other.is_exact = False
+        return other
+
+    def forward(self, coordinates: Tensor) -> Tensor:
+        """Corrections for coordinates of loads, one after the other.
+
+        Raises:
+            NotConverged: no equilibrium was found.
+        """
+        return torch.stack([self.linearised(load).values for load in coordinates])
+
+    def linearised(self, coordinates: Tensor, near: Linearisation | None = None) -> GalerkinState:
+        """The state under one load, (r,).
+
+        Args:
+            coordinates: of the load.
+            near: a state to start from, where there is one.
+
+        Raises:
+            NotConverged: no equilibrium was found.
+        """
+        load = coordinates.to(self.slopes)
+        start = near if isinstance(near, GalerkinState) and near.network.slopes is self.slopes else None
+        return GalerkinState(self, load, *_Search(self, load).found(start))
+
+    @staticmethod
+    def from_state_dict(tensors: Mapping[str, Tensor]) -> GalerkinNetwork:
+        """The network from what its `state_dict` was."""
+        law = bytes(tensors["law"].tolist()).decode()
+        parameters = {n.removeprefix(_PARAMETER): v for n, v in tensors.items() if n.startswith(_PARAMETER)}
+        return GalerkinNetwork(law, parameters, tensors["slopes"], tensors["weights"], tensors["support"])
+
+    def shares(self, q: Tensor) -> Floats:
+        """Of each cell in the forces along the modes, (r, p), in the energy norm at rest, as shares of a force of one.
+
+        Where a cell of the state is nearly inside out, it is that of a smaller one.
+
+        Args:
+            q: coordinates of the displacement, (r,), metres.
+        """
+        while not self._law.is_linear and float(TorchAlgebra(q).det(self.gradients(q)).min()) < _LEAST_JACOBIAN:
+            q = 0.8 * q
+        stress = self._density(self.gradients(q), 1).first * self.weights[:, None]
+        forces = torch.einsum("pir,pi->rp", self.slopes, stress)
+        forces = torch.linalg.solve_triangular(self.rest_factor, forces, upper=False)
+        found: Floats = (forces / torch.linalg.vector_norm(forces.sum(dim=1)).clamp_min(1e-300)).numpy()
+        return found
+
+    # ------------------------------------------------------------------ energy, forces, stiffness
+
+    @cached_property
+    def flat(self) -> Tensor:
+        """Slopes, (9p, r)."""
+        return self.slopes.flatten(0, 1)
+
+    @cached_property
+    def _single(self) -> tuple[Tensor, Tensor]:
+        return self.slopes.float(), self.flat.float().mT.contiguous()
+
+    @cached_property
+    def _law(self) -> Material:
+        """The law, whatever its constants: those that count are the buffers'."""
+        return MATERIALS[bytes(self.law.tolist()).decode()](1.0, 0.0)
+
+    @cached_property
+    def rest_factor(self) -> Tensor:
+        """Cholesky factor of the stiffness at rest."""
+        return torch.linalg.cholesky(self.at_rest)
+
+    @cached_property
+    def noise(self) -> tuple[float, float]:
+        """What rounding makes of energies, joules, and of forces, newtons: a density is rounded as its terms are."""
+        moduli = self._moduli(torch.zeros_like(self.at_rest[0]))
+        stiffest = _EPSILONS * torch.finfo(moduli.dtype).eps * float(moduli.abs().max())
+        size = torch.linalg.vector_norm(self.slopes * self.weights[:, None, None])
+        return stiffest * float(self.weights.sum()), stiffest * float(size)
+
+    def gradients(self, q: Tensor) -> Tensor:
+        """F, (p, 3, 3)."""
+        unit = torch.eye(3, dtype=q.dtype, device=q.device)
+        return unit + (self.flat @ q).reshape(-1, 3, 3)
+
+    def energy_and_forces(self, q: Tensor) -> tuple[float, Tensor]:
+        """Stored energy, joules, infinite where a cell is inside out, and its derivative, (r,)."""
+        F, held = self.gradients(q), self.support @ q
+        if not self._law.is_linear and float(TorchAlgebra(F).det(F).min()) <= 0.0:
+            return float("inf"), held
+        density = self._density(F, 1)
+        energy = float(density.value @ self.weights + 0.5 * (held @ q))
+        return energy, self.flat.mT @ (density.first * self.weights[:, None]).reshape(-1) + held
+
+    def stiffness(self, q: Tensor, exact: bool = True) -> Tensor:
+        """Second derivative of the stored energy, (r, r), N/m; in single precision where six digits are enough."""
+        moduli = self._moduli(q) * self.weights[:, None, None]
+        size = self.slopes.shape[2]
+        if exact:
+            return self.flat.mT @ torch.bmm(moduli, self.slopes).reshape(-1, size) + self.support
+        slopes, turned = self._single
+        return (turned @ torch.bmm(moduli.float(), slopes).reshape(-1, size)).to(q) + self.support
+
+    def _moduli(self, q: Tensor) -> Tensor:
+        """Second derivatives of the energy density by F, (p, 9, 9), pascals."""
+        second = self._density(self.gradients(q), 2).second
+        assert second is not None
+        return second.expand(len(self.slopes), 9, 9)
+
+    def _density(self, F: Tensor, order: int) -> Jet:
+        """Strain energy a cubic metre at deformation gradients, (p, 3, 3), with its derivatives."""
+        algebra, parameters = JetAlgebra(order), SimpleNamespace(**self.parameters_of_law)
+        density: Jet = self._law.energy(algebra.variable(F), None, parameters, algebra)
+        return density
+
+
+class _Search:
+    """Newton's method for the state of least potential energy under one load; tangents serve as long as they do well."""
+
+    def __init__(self, network: GalerkinNetwork, load: Tensor) -> None:
+        self.network, self.load = network, load
+        self.size = float(torch.linalg.vector_norm(load))
+        noise_of_energy, noise_of_forces = network.noise
+        self.noise = noise_of_energy
+        self.enough = max((_TOLERANCE if network.is_exact else _ROUGH) * self.size, noise_of_forces)
+
+    def _look(self, q: Tensor) -> tuple[float, Tensor]:
+        stored, forces = self.network.energy_and_forces(q)
+        return stored - float(self.load @ q), self.load - forces
+
+    def found(self, near: GalerkinState | None) -> tuple[Tensor, Tensor]:
+        """Coordinates of the state, and the last factor of a tangent."""
+        q, factor, is_fresh = torch.zeros_like(self.load), self.network.rest_factor, True
+        energy, missing = self._look(q)
+        if near is not None:
+            start = near.q + torch.cholesky_solve((self.load - near.load)[:, None], near.factor)[:, 0]
+            there = self._look(start)
+            if there[0] < float("inf"):
+                q, factor, is_fresh, (energy, missing) = start, near.factor, False, there
+        for _ in range(_ITERATIONS):
+            left = float(torch.linalg.vector_norm(missing))
+            if left <= self.enough:
+                return q, factor
+            step = torch.cholesky_solve(missing[:, None], factor)[:, 0]
+            length, there = self._length(q, step, energy, missing)
+            if length:
+                q, (energy, missing) = q + length * step, there
+            elif is_fresh:
+                break
+            is_slow = length < 1.0 or float(torch.linalg.vector_norm(missing)) > _FAST * left
+            is_fresh = is_slow
+            if is_slow:
+                factor = self._factor(q)
+        raise NotConverged(
+            f"GalerkinNetwork: no equilibrium was found; out-of-balance forces are {left / self.size:.1e} of the "
+            "load's. The load may be too large: try a smaller one."
+        )
+
+    def _length(self, q: Tensor, step: Tensor, energy: float, missing: Tensor) -> tuple[float, tuple[float, Tensor]]:
+        """Length of a step that lowers the energy, or leaves it and brings forces nearer to balance; 0 for none."""
+        slope, before, length = float(missing @ step), float(torch.linalg.vector_norm(missing)), 1.0
+        while length >= _SHORTEST:
+            there = self._look(q + length * step)
+            change = there[0] - energy
+            if change <= -_DESCENT * length * slope:
+                return length, there
+            if abs(change) <= self.noise and float(torch.linalg.vector_norm(there[1])) < before:
+                return length, there
+            length *= 0.5
+        return 0.0, (energy, missing)
+
+    def _factor(self, q: Tensor) -> Tensor:
+        tangent = self.network.stiffness(q, self.network.is_exact)
+        factor, info = torch.linalg.cholesky_ex(tangent)
+        for shift in _SHIFTS:
+            if not int(info):
+                break
+            factor, info = torch.linalg.cholesky_ex(tangent + shift * self.network.at_rest)
+        return factor
+
+
+class GalerkinState:
+    """A state of least energy under one load, with its derivative.
+
+    Args:
+        network: that found it.
+        load: coordinates of the load, (r,).
+        q: coordinates of the displacement, (r,).
+        factor: of a tangent nearby, (r, r).
+    """
+
+    def __init__(self, network: GalerkinNetwork, load: Tensor, q: Tensor, factor: Tensor) -> None:
+        self.network, self.load, self.q, self.factor = network, load, q, factor
+        self.values = q - torch.cholesky_solve(load[:, None], network.rest_factor)[:, 0]
+
+    @cached_property
+    def _tangent(self) -> Tensor:
+        """Factor of the tangent here; the last one of the search where six digits are enough and it is as near."""
+        tangent = self.network.stiffness(self.q, self.network.is_exact)
+        factor, info = torch.linalg.cholesky_ex(tangent)
+        if int(info):
+            return self.factor
+        self.factor = factor
+        return factor
+
+    def jvp(self, tangents: Tensor) -> Tensor:
+        """Changes of the values, (r, k), for changes of the coordinates, (r, k)."""
+        changes = tangents.to(self.q)
+        return torch.cholesky_solve(changes, self._tangent) - torch.cholesky_solve(changes, self.network.rest_factor)
+
+    def vjp(self, cotangent: Tensor) -> Tensor:
+        """Gradient with respect to the coordinates, (r,), for one with respect to the values, (r,): symmetric."""
+        return self.jvp(cotangent[:, None])[:, 0]
