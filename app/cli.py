@@ -46,6 +46,7 @@ from .config import (
     RegistrationSection,
     SamplesSection,
     TrainingSection,
+    default_samples,
     parse_config,
     to_toml,
 )
@@ -442,9 +443,9 @@ def report(configuration: Path, registrations: tuple[Path, ...]) -> None:
     unset=("unit", "frame", "cavities"),
 )
 @flags(MaterialSection, ("young_modulus", "poisson_ratio", "law"))
-@flags(SamplesSection, ("train", "jacobians", "load_path", "ranks"))
+@flags(SamplesSection, ("train", "jacobians", "load_path", "ranks"), unset=("train",))
 @flags(LoadsSection, ("displacement",))
-@flags(TrainingSection, ("seconds",))
+@flags(TrainingSection, ("architecture", "seconds"))
 @flags(TrainArguments)
 @flags(BuildArguments)
 def build(
@@ -488,22 +489,23 @@ def build(
         "cavities": given["cavities"] or "",
         **{name: given[name] for name in ("nodes", "cell_size", "grid", "fixed_distance", "component")},
     }
+    train = given["train"] or default_samples(given["architecture"])
     entries = {
         "folder": ".",
         "body": body,
         "material": {name: given[name] for name in ("law", "young_modulus", "poisson_ratio")},
         "loads": {"displacement": given["displacement"], "zones": sorted(body["zones"])},
         "samples": {
-            "train": given["train"],
-            "validation": max(8, given["train"] // 8),
-            "test": max(8, given["train"] // 4),
-            "calibration": max(12, given["train"] // 4),
-            "smooth": max(8, given["train"] // 8),
+            "train": train,
+            "validation": max(8, train // 8),
+            "test": max(8, train // 4),
+            "calibration": max(12, train // 4),
+            "smooth": max(8, train // 8),
             "ranks": given["ranks"],
             "load_path": given["load_path"],
             "jacobians": given["jacobians"],
         },
-        "training": {"seconds": given["seconds"]},
+        "training": {name: given[name] for name in ("architecture", "seconds")},
     }
     build_twin(parse_config(entries, "command line"), output, click.echo, again, given["device"], given["processes"])
 

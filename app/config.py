@@ -273,6 +273,11 @@ class SamplesSection(Section):
         return self
 
 
+def default_samples(architecture: str) -> int:
+    """Equilibria that `build` makes for an architecture: a Galerkin model only extends its basis by them."""
+    return 32 if architecture == "galerkin" else 512
+
+
 class SolverSection(Section):
     """Newton's method in the reference."""
 
@@ -290,8 +295,10 @@ class TrainingSection(Section):
 
     architecture: Literal["reduced", "galerkin", "mlp", "umesh", "transolver"] = option(
         "reduced",
-        "reduced network, or galerkin, equilibria in the span of a few modes, which learns nothing; as yardsticks the thesis's perceptron (mlp) and U-Mesh (umesh, on a regular grid), and a "
+        "reduced network; galerkin: equilibria in the span of a few modes, which takes a tenth of the equilibria and "
+        "learns nothing; as yardsticks the thesis's perceptron (mlp) and U-Mesh (umesh, on a regular grid), and a "
         "transolver",
+        basic=True,
     )
     modes: int = option(64, "displacement modes (POD) of the reduced network", ge=1)
     width: int = option(256, "width of its blocks", ge=1)

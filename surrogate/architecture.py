@@ -38,6 +38,9 @@ class Network(nn.Module):
     Its derivatives come from torch.func, unless it brings its own because they were measured to pay.
     """
 
+    is_graph = True
+    """Whether values are always made by the same operations, so that other programs can be given them."""
+
     def linearised(self, coordinates: Tensor, near: Linearisation | None = None) -> Linearisation:
         """The network at one point, (d,).
 
@@ -135,6 +138,7 @@ class Architecture(Protocol):
         """The predicting network from what its `state_dict` was."""
 
 
+@runtime_checkable
 class TrainedArchitecture(Architecture, Protocol):
     """One whose weights are found step by step."""
 

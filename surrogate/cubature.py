@@ -45,7 +45,7 @@ def sparse_weights(shares: Floats, tolerance: float, most: int) -> tuple[Ints, F
         weights = np.concatenate([weights, np.zeros(len(new))])
         active, weights, products = _least_squares(active, weights, products, right)
         missing = wanted - shares[:, active] @ weights
-    return np.array(active, dtype=np.int64), weights, float(np.linalg.norm(missing)) / size
+    return np.array(active, dtype=np.int64), weights, float(np.linalg.norm(missing)) / max(size, 1e-300)
 
 
 def _grown(products: Floats, shares: Floats, active: list[int], new: Ints) -> Floats:

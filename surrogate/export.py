@@ -128,12 +128,17 @@ def export(surrogate: Surrogate, folder: Path | str, directions: int = 64) -> Pa
         directions: most directions of force for the second: those that move the body most.
 
     Raises:
-        ValueError: fewer than one direction, or another folder is there.
+        ValueError: fewer than one direction, another folder is there, or a model that searches for its states.
         ModuleNotFoundError: `onnx` and `onnxscript` are absent: `pip install 'softtwin[onnx]'`.
     """
     folder = Path(folder)
     if folder.exists() and not (folder / MANIFEST).exists():
         raise ValueError(f"export.folder: expected none, or one that was exported before, got {folder}.")
+    if not surrogate.network.is_graph:
+        raise ValueError(
+            f"export.surrogate: expected a network, got {surrogate.card.get('architecture', 'one')} that searches for "
+            "equilibria, which no graph does; train one (architecture reduced)."
+        )
     _need_onnx()
     basis = leading_directions(surrogate, directions)
     inputs = 3 * len(surrogate.encoder_decoder.loaded)

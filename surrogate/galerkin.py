@@ -26,11 +26,11 @@ from .tangents import layers_of
 from .warping import Warping
 
 Floats = NDArray[np.float64]
-_LOADS = 256  # typical loads, that nothing is solved for but linear responses
+_LOADS = 128  # typical loads, that nothing is solved for but linear responses
 _LEAST_SHARE = 0.2  # of the usual top, that the smallest of them are
 _STATES = 48  # of typical loads, that the cells are chosen by
-_SKETCH = 2000  # combinations of what the cells are chosen by (Johnson and Lindenstrauss 1984)
-_OWN = 32  # equilibria, at most, that the basis is told of
+_SKETCH = 5000  # combinations of what the cells are chosen by (count sketch: Charikar, Chen, Farach-Colton 2004)
+_OWN, _TANGENTS = 32, 24  # equilibria, at most, that the basis is told of, and whose tangents
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class Galerkin:
         ValueError: an argument out of its range.
     """
 
-    modes: int = 24
+    modes: int = 20
     curved: int = 16
-    derivatives: int = 48
-    own: int = 24
-    cells: int = 400
+    derivatives: int = 36
+    own: int = 16
+    cells: int = 300
     tolerance: float = 0.005
 
     name: ClassVar[str] = "galerkin"
@@ -88,15 +88,17 @@ class Galerkin:
             ValueError: a law that is not one of `MATERIALS`, or ligaments, whose forces no cell carries.
         """
         law = _law_of(data)
-        if ligaments_of(data.springs):
+        cords = sorted(ligaments_of(data.springs))
+        if cords:
             raise ValueError(
-                f"Galerkin.data: expected springs on surfaces alone, got the ligaments {sorted(ligaments_of(data.springs))}; "
+                f"Galerkin.data: expected springs on surfaces alone, got the ligaments {cords}; "
                 "learn a network (architecture reduced), or register with --model torch or reference."
             )
         elastic = ElasticBody(data.body, data.material, springs=data.springs)
         tangent = FactoredTangent(elastic)
         linear = tangent.inverse(_spread(data, typical_loads(data, train)).T).T
         basis = self.basis(tangent, linear, train.displacements[:_OWN])
+        basis.reshape(-1, 3, basis.shape[1])[data.body.fixed] = 0.0  # rounding leaves 1e-17
         network = self._network(law, elastic, basis, linear, train.displacements[:_OWN], data.body.size)
         left, right = response_parts(data.response)
         at_loaded = basis.reshape(-1, 3, basis.shape[1])[data.response.loaded].reshape(-1, basis.shape[1])
@@ -128,25 +130,21 @@ class Galerkin:
         scale = 1.0 / np.sqrt(np.maximum(np.linalg.norm(flat, axis=1), 1e-300))
         at_rest = tangent.elastic.stiffness(torch.zeros(tangent.elastic.nodes, 3, dtype=torch.float64))
         forces = at_rest @ modes[:, : self.curved]
-        changes = [FactoredTangent(tangent.elastic, state).inverse(forces).T for state in own]
+        changes = [FactoredTangent(tangent.elastic, state).inverse(forces).T for state in own[:_TANGENTS]]
         return flat * scale[:, None], np.concatenate(changes)
 
-    def _network(self, law: str, elastic: ElasticBody, basis: Floats, linear: Floats, own: Floats, extent: float) -> GalerkinNetwork:
-        size = basis.shape[1]
-        nodal = torch.from_numpy(basis.reshape(-1, 3, size))[elastic.cells]
-        slopes = torch.einsum("ckir,cqkj->cqijr", nodal, elastic.gradients).reshape(-1, 9, size)
-        weights = elastic.volumes.reshape(-1)
+    def _network(
+        self, law: str, elastic: ElasticBody, basis: Floats, linear: Floats, own: Floats, extent: float
+    ) -> GalerkinNetwork:
+        slopes, weights = slopes_of(elastic, basis), elastic.volumes.reshape(-1)
         points = elastic.volumes.shape[1]
         parameters = {
             name: getattr(elastic, f"parameter_{name}").expand(len(elastic.volumes), points).reshape(-1)
             for name in elastic.material.parameters
         }
-        whole = GalerkinNetwork(law, parameters, slopes, weights, _support(elastic, basis))
+        whole = GalerkinNetwork(law, parameters, slopes, weights, support_of(elastic, basis))
         states = np.concatenate([_warped(elastic, linear, extent), own.reshape(len(own), -1)])
-        shares = np.concatenate([whole.shares(torch.from_numpy(state @ basis)) for state in states])
-        if len(shares) > _SKETCH:
-            signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(_SKETCH, len(shares)))
-            shares = signs @ shares / np.sqrt(_SKETCH)
+        shares = _sketched([whole.shares(torch.from_numpy(state @ basis)) for state in states])
         taken, factors, _ = sparse_weights(shares, self.tolerance, self.cells)
         chosen = torch.from_numpy(taken)
         own_parameters = {name: values[chosen] for name, values in parameters.items()}
@@ -194,9 +192,7 @@ def _law_of(data: DataSet) -> str:
     for name, kind in MATERIALS.items():
         if type(data.material) is kind and not data.material.is_mixed:
             return name
-    raise ValueError(
-        f"Galerkin.data: expected a law among {sorted(MATERIALS)}, got {type(data.material).__name__}."
-    )
+    raise ValueError(f"Galerkin.data: expected a law among {sorted(MATERIALS)}, got {type(data.material).__name__}.")
 
 
 def _spread(data: DataSet, forces: Floats) -> Floats:
@@ -206,11 +202,30 @@ def _spread(data: DataSet, forces: Floats) -> Floats:
     return whole.reshape(len(forces), -1)
 
 
+def _sketched(parts: list[Floats]) -> Floats:
+    """Rows of all parts, or fewer signed sums of them that have the same scalar products in the mean."""
+    rng, size = np.random.default_rng(0), len(parts[0])
+    groups = max(1, _SKETCH // size)
+    if len(parts) <= groups:
+        return np.concatenate(parts)
+    found = np.zeros((groups, *parts[0].shape))
+    for number, part in enumerate(parts):
+        found[number % groups] += rng.choice([-1.0, 1.0], size=(size, 1)) * part
+    return found.reshape(-1, parts[0].shape[1])
+
+
 def _joined(modes: Floats, more: Floats) -> Floats:
     return np.linalg.qr(np.hstack([modes, more]))[0]
 
 
-def _support(elastic: ElasticBody, basis: Floats) -> Tensor:
+def slopes_of(elastic: ElasticBody, basis: Floats) -> Tensor:
+    """Gradients of modes, (3n, r), at the points of the quadrature, (p, 9, r), 1/m."""
+    size = basis.shape[1]
+    nodal = torch.from_numpy(basis.reshape(-1, 3, size))[elastic.cells]
+    return torch.einsum("ckir,cqkj->cqijr", nodal, elastic.gradients).reshape(-1, 9, size)
+
+
+def support_of(elastic: ElasticBody, basis: Floats) -> Tensor:
     """Stiffness of the springs between modes, (r, r), N/m."""
     size = basis.shape[1]
     if not len(elastic.sprung):

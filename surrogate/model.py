@@ -312,9 +312,7 @@ class ReducedSurrogateState:
         self.model, self.coefficients = model, coefficients
         coordinates = (model.encode @ coefficients).astype(np.float32)
         self.inner = model.surrogate.single.linearised(torch.from_numpy(coordinates), near)
-        moved = model.offset_rows + model.rows @ np.concatenate(
-            [coefficients, self.inner.values.numpy()[model.wanted]]
-        )
+        moved = model.offset_rows + model.rows @ np.concatenate([coefficients, self.inner.values.numpy()[model.wanted]])
         self.positions: Floats = moved.reshape(-1, 3)
 
     @cached_property

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, get_args
 
-from .architecture import Architecture
+from .architecture import Architecture, TrainedArchitecture
 from .physics import Physics
 from .reduced import Reduced
 
@@ -70,13 +70,19 @@ class TrainingPlan:
             raise ValueError(f"TrainingPlan.precision: expected one of {get_args(Precision)}, got {self.precision!r}.")
 
     @property
+    def trained(self) -> TrainedArchitecture:
+        """The architecture, of those that are trained step by step."""
+        assert isinstance(self.architecture, TrainedArchitecture), "others are made at once, without steps"
+        return self.architecture
+
+    @property
     def rate(self) -> float:
         """Highest learning rate."""
-        return self.learning_rate or self.architecture.rate
+        return self.learning_rate or self.trained.rate
 
     def batch_size(self, count: int) -> int:
         """Samples a step when there are so many: as many for each process."""
-        each = -(-min(self.batch or self.architecture.batch, count) // self.processes)
+        each = -(-min(self.batch or self.trained.batch, count) // self.processes)
         return each * self.processes
 
     def entries(self) -> dict[str, Any]:

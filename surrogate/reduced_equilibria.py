@@ -46,6 +46,7 @@ class GalerkinNetwork(Network):
         support: stiffness of what holds the body and gives way, between modes, (r, r), N/m.
     """
 
+    is_graph = False
     slopes: Tensor
     weights: Tensor
     support: Tensor
@@ -187,7 +188,7 @@ class GalerkinNetwork(Network):
 
 
 class _Search:
-    """Newton's method for the state of least potential energy under one load; tangents serve as long as they do well."""
+    """Newton's method for the state of least potential energy under one load; tangents serve while they do well."""
 
     def __init__(self, network: GalerkinNetwork, load: Tensor) -> None:
         self.network, self.load = network, load

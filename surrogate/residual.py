@@ -19,6 +19,7 @@ from softtwin.reference.data.materials import Energy, Material
 from softtwin.reference.data.springs import Support, cell_springs, on_surfaces
 
 from .algebra import TorchAlgebra
+from .jets import JetAlgebra
 from .ligaments import Ligaments
 
 
@@ -261,6 +262,19 @@ class ElasticBody(nn.Module):
 
     def moduli(self, F: Tensor) -> Tensor:
         """Second derivatives of the energy density by F, pascals: (..., 3, 3, 3, 3) for (..., 3, 3)."""
+        if self.minimum_jacobian:
+            return self._moduli_by_autograd(F)
+        algebra, shape = JetAlgebra(2), F.shape[:-2]
+        parameters = {
+            name: values.reshape(-1) if values.numel() == 1 else values.expand(shape).reshape(-1)
+            for name, values in ((n, getattr(self, f"parameter_{n}")) for n in self.material.parameters)
+        }
+        at = algebra.variable(F.reshape(-1, 3, 3))
+        second = self.material.energy(at, None, SimpleNamespace(**parameters), algebra).second
+        found: Tensor = second.expand(at.value.shape[0], 9, 9).reshape(*shape, 3, 3, 3, 3)
+        return found
+
+    def _moduli_by_autograd(self, F: Tensor) -> Tensor:
         stress = torch.func.grad(lambda at: self.density(at).sum())
 
         def component(i: int, j: int) -> Callable[[Tensor], Tensor]:

@@ -59,7 +59,7 @@ def train(
         resumed = read_checkpoint(path, plan, mark) if path.exists() else None
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(plan.seed)
-            objective = plan.architecture.objective(data, splits["train"], splits["validation"])
+            objective = plan.trained.objective(data, splits["train"], splits["validation"])
         objective = with_physics(objective, data, plan.physics).to(where)
         training_module = TrainingModule(objective, plan, mark, clock)
         if resumed:

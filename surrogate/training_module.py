@@ -161,7 +161,7 @@ class TrainingModule(lightning.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """The architecture's."""
-        return self.plan.architecture.optimizer(self.objective.network, self.plan.rate)
+        return self.plan.trained.optimizer(self.objective.network, self.plan.rate)
 
     def train_dataloader(self) -> Batches:
         """Sample numbers of the steps of the current round."""

@@ -1,4 +1,4 @@
-"""One suite over all forward models: the reference, from rest and from a network, torch's solver, and two networks.
+"""One suite over all forward models: the reference, from rest and from a network, torch's solver, and three surrogates.
 
 The thesis's perceptron is the yardstick: it vanishes nowhere by construction and has kinks between its linear pieces.
 Tests of what it cannot do name the models that they are for.
@@ -24,13 +24,15 @@ from softtwin.reference.solve.problem import NewtonOptions, Problem
 from softtwin.registration.forward import ForwardModel
 from softtwin.surrogate.equilibria import Equilibria
 from softtwin.surrogate.equilibria_model import EquilibriaModel
+from softtwin.surrogate.galerkin import Galerkin
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.train import train
 
 pytestmark = pytest.mark.fenicsx
-ALL, EXACT = ("reference", "hybrid", "torch", "reduced", "mlp"), ("reference", "hybrid", "torch", "reduced")
+EXACT = ("reference", "hybrid", "torch", "reduced", "galerkin")
+ALL = (*EXACT, "mlp")
 PLAN = Plan(loads=LoadPlan(modes=6, displacement=0.1), samples={"train": 32, "validation": 4, "test": 4}, block=4)
 
 
@@ -42,7 +44,7 @@ def data(tmp_path_factory: pytest.TempPathFactory, hexahedral_beam: Body) -> Dat
 
 
 EPOCHS = 120  # that the networks have learned what is not linear
-_NETWORKS = {"reduced": Reduced(modes=16, width=32), "mlp": Perceptron()}
+_NETWORKS = {"reduced": Reduced(modes=16, width=32), "galerkin": Galerkin(), "mlp": Perceptron()}
 
 
 @pytest.fixture(scope="module", params=ALL)
