@@ -178,10 +178,7 @@ def typical_loads(data: DataSet, train: Samples) -> Floats:
     found = []
     for number in range(_LOADS):
         rng = np.random.default_rng([0, number])
-        if number % 2:
-            load = draw_smooth_load(data.body, plan, rng)
-        else:
-            load = draw_load(data.body, data.shapes, plan, rng)
+        load = draw_smooth_load(data.body, plan, rng) if number % 2 else draw_load(data.body, data.shapes, plan, rng)
         at_loaded = load[data.response.loaded]
         peak = float(np.linalg.norm(data.response.apply(at_loaded[None])[0], axis=1).max())
         found.append(at_loaded * (rng.uniform(_LEAST_SHARE, 1.0) * top / max(peak, 1e-300)))
