@@ -327,6 +327,17 @@ class TrainingSection(Section):
         {},
         "weights in the loss of energy, residual and data (1): { energy = 0.1 }; empty: the data alone",
     )
+    vary: dict[str, tuple[float, float]] = option(
+        {},
+        "least and largest value of what is not known of the tissue (poisson-ratio, young-modulus@STRUCTURE), which "
+        "the surrogate is then to know; galerkin alone: { poisson-ratio = [0.4, 0.49] }",
+    )
+
+    @model_validator(mode="after")
+    def _galerkin_alone_varies(self) -> TrainingSection:
+        if self.vary and self.architecture != "galerkin":
+            raise ValueError(f"training.vary: expected architecture galerkin beside it, got {self.architecture}")
+        return self
 
 
 class ModelErrorSection(Section):
@@ -534,8 +545,8 @@ class RegistrationSection(Section):
         models = ["surrogate", "reference", "hybrid", "torch"]
         if "contact" in kinds:
             models.remove("hybrid")
-        if others:  # a network has learned one material
-            models = ["reference", "hybrid", "torch"]
+        if any(each.kind not in ("young-modulus", "poisson-ratio") for each in others):
+            models.remove("surrogate")  # it has one support
         if self.known_forces:  # they are added to those that the network is asked for, where both engines know of them
             models = [model for model in models if model != "surrogate"]
         of_gravity = {"weight", "gravity"} & set(kinds)
@@ -593,6 +604,26 @@ class Config(Section):
     def supports(self) -> dict[str, Support]:
         """The springs of each part of the surface, and ligaments, by name."""
         return self.springs.supports(self.body.unit, files_axes(self.body) == "ras")
+
+    @model_validator(mode="after")
+    def _surrogate_knows_the_tissue(self) -> Config:
+        if self.registration.model != "surrogate":
+            return self
+        named = [NamedParameter.parse(text) for text in self.registration.parameters]
+        asked = [f"{each.kind}@{each.place}".rstrip("@") for each in named if each.is_input]
+        if asked and self.training.architecture != "galerkin":
+            raise ValueError(
+                f"registration.model: expected reference or hybrid or torch with {asked[0]} (a network has learned one "
+                "material, one support and forces alone; training.architecture galerkin takes others), got surrogate"
+            )
+        unknown = [name for name in asked if name not in self.training.vary and name != "young-modulus"]
+        if unknown:
+            raise ValueError(
+                f"registration.parameters: expected parameters that the surrogate knows a range of (training.vary: "
+                f"{', '.join(self.training.vary) or 'none'}), got {unknown[0]}; name its range there and train again, "
+                "or use --model reference, torch or hybrid"
+            )
+        return self
 
     @model_validator(mode="after")
     def _springs_are_there(self) -> Config:

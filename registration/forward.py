@@ -253,6 +253,11 @@ class _PickedModel:
         return _PickedState(self, coefficients, unknown, full)
 
 
+def _takes(model: Any) -> bool:
+    """Whether it takes inputs though it can be reduced."""
+    return bool(getattr(model, "takes_inputs", False))
+
+
 def reduce_model(model: Any, nodes: Ints, basis: Floats, inputs: UnknownInputs | None = None) -> ReducedModel:
     """A model from force coefficients to the displacement of some nodes.
 
@@ -268,7 +273,7 @@ def reduce_model(model: Any, nodes: Ints, basis: Floats, inputs: UnknownInputs |
         ValueError: the model was learned for one material and one support, and there are such unknowns.
     """
     every_model_takes_them = inputs is not None and inputs.has_forces_alone
-    if not hasattr(model, "reduced") or every_model_takes_them:
+    if not hasattr(model, "reduced") or every_model_takes_them or (inputs is not None and _takes(model)):
         return _PickedModel(model, nodes, basis, inputs)
     if inputs is not None:
         raise ValueError(

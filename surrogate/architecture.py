@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from softtwin.meshes.body import Body
@@ -49,6 +50,20 @@ class Network(nn.Module):
             near: the network at a point nearby, for those that look for their values and find them sooner so.
         """
         return Differentiated(self, coordinates)
+
+    def with_parameters(self, values: Mapping[str, ArrayLike]) -> Network:
+        """The same for a tissue of other parameters.
+
+        Args:
+            values: a number, or one for each cell of the body, by the parameters' names; others stay.
+
+        Raises:
+            ValueError: it has learned one tissue.
+        """
+        raise ValueError(
+            f"{type(self).__name__}: expected the tissue that it has learned, got other values of {sorted(values)}; "
+            "the galerkin architecture takes them, and so do --model reference, torch and hybrid."
+        )
 
     def rounded(self) -> Network:
         """The same, good to six digits, and faster."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples, stored_plans
-from softtwin.reference.data.materials import MATERIALS
+from softtwin.reference.data.materials import MATERIALS, Material, with_parameters
 from softtwin.reference.data.samplers import LoadPlan, draw_load, draw_smooth_load
 from softtwin.reference.data.springs import ligaments_of
 
@@ -26,11 +26,30 @@ from .tangents import layers_of
 from .warping import Warping
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+_VARIED = {"poisson-ratio": "poisson_ratio", "young-modulus": "young_modulus"}
+_MODES_MORE, _DERIVATIVES_MORE, _CELLS_MORE = 5, 6, 60  # for each tissue beside the expected one
+_INSIDE = 0.3  # of a whole body's forces, that those of a structure count as
 _LOADS = 128  # typical loads, that nothing is solved for but linear responses
 _LEAST_SHARE = 0.2  # of the usual top, that the smallest of them are
 _STATES = 48  # of typical loads, that the cells are chosen by
 _SKETCH = 5000  # combinations of what the cells are chosen by (count sketch: Charikar, Chen, Farach-Colton 2004)
 _OWN, _TANGENTS = 32, 24  # equilibria, at most, that the basis is told of, and whose tangents
+
+
+@dataclass(frozen=True, eq=False)
+class Variation:
+    """A tissue that the model is to know beside the one that is expected.
+
+    Args:
+        material: the law with its parameters.
+        parameters: those that differ, one for each cell of the body.
+        cells: numbers of the cells where they do; None for all.
+    """
+
+    material: Material
+    parameters: Mapping[str, Floats]
+    cells: Ints | None
 
 
 @dataclass(frozen=True)
@@ -44,6 +63,8 @@ class Galerkin:
         own: modes of what the equilibria of the training split, and their tangents, add; 0 leaves them out.
         cells: that stand for the body, about.
         tolerance: of internal forces by these cells, relative, below which no more are taken.
+        vary: least and largest value of what is not known of the tissue, by name: `poisson-ratio`, `young-modulus`, or
+            `young-modulus@STRUCTURE` of what lies in a closed inner surface. States may be asked for with any of it.
 
     Raises:
         ValueError: an argument out of its range.
@@ -55,6 +76,7 @@ class Galerkin:
     own: int = 16
     cells: int = 300
     tolerance: float = 0.005
+    vary: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     name: ClassVar[str] = "galerkin"
 
@@ -67,6 +89,14 @@ class Galerkin:
                 raise ValueError(f"Galerkin.{name}: expected at least 0, got {getattr(self, name)}.")
         if not 0.0 < self.tolerance < 1.0:
             raise ValueError(f"Galerkin.tolerance: expected a number between 0 and 1, got {self.tolerance}.")
+        for name, ends in self.vary.items():
+            kind, _, place = name.partition("@")
+            if kind not in _VARIED or (place and kind != "young-modulus"):
+                raise ValueError(
+                    f"Galerkin.vary: expected {', '.join(_VARIED)} or young-modulus@STRUCTURE, got {name!r}."
+                )
+            if len(ends) != 2 or not 0.0 < ends[0] < ends[1] < np.inf:
+                raise ValueError(f"Galerkin.vary: expected two growing positive numbers for {name}, got {list(ends)}.")
 
     def check(self, body: Body) -> None:
         """Any body in space will do.
@@ -94,47 +124,94 @@ class Galerkin:
                 f"Galerkin.data: expected springs on surfaces alone, got the ligaments {cords}; "
                 "learn a network (architecture reduced), or register with --model torch or reference."
             )
+        variations = self.variations(data.body, data.material)
         elastic = ElasticBody(data.body, data.material, springs=data.springs)
-        tangent = FactoredTangent(elastic)
-        linear = tangent.inverse(_spread(data, typical_loads(data, train)).T).T
-        basis = self.basis(tangent, linear, train.displacements[:_OWN])
+        bodies = [elastic, *(elastic.with_material(each.material) for each in variations)]
+        loads = _spread(data, typical_loads(data, train))
+        tangents = [FactoredTangent(body) for body in bodies]
+        linear = [tangent.inverse(loads.T).T for tangent in tangents]
+        own = train.displacements[:_OWN]
+        basis = self.basis(tangents, linear, own)
         basis.reshape(-1, 3, basis.shape[1])[data.body.fixed] = 0.0  # rounding leaves 1e-17
-        network = self._network(law, elastic, basis, linear, train.displacements[:_OWN], data.body.size)
+        states = [_warped(body, fields, data.body.size) for body, fields in zip(bodies, linear, strict=True)]
+        states[0] = np.concatenate([states[0], own.reshape(len(own), -1)])
+        network = self._network(law, elastic, basis, states, variations)
         left, right = response_parts(data.response)
         at_loaded = basis.reshape(-1, 3, basis.shape[1])[data.response.loaded].reshape(-1, basis.shape[1])
         encode = np.ascontiguousarray(at_loaded.T)
         return LinearEncoderDecoder(data.response.loaded, np.zeros(len(left)), left, right, encode, basis), network
 
-    def basis(self, tangent: FactoredTangent, linear: Floats, own: Floats) -> Floats:
+    def variations(self, body: Body, material: Material) -> list[Variation]:
+        """The tissue at either end of each range.
+
+        Args:
+            body: that has the structures which `vary` names.
+            material: the tissue as it is expected.
+
+        Raises:
+            ValueError: no such structure, a range that the law refuses, or that does not hold what is expected.
+        """
+        found = []
+        for name, ends in self.vary.items():
+            parameter, cells = varied(name, body)
+            expected = np.broadcast_to(np.asarray(material.parameters[parameter], dtype=np.float64), len(body.cells))
+            here = expected if cells is None else expected[cells]
+            if not (min(ends) <= here.min() and here.max() <= max(ends)):
+                raise ValueError(
+                    f"Galerkin.vary: expected a range of {name} that holds what the tissue has, {here.min():g} to "
+                    f"{here.max():g}, got {ends[0]:g} to {ends[1]:g}."
+                )
+            for end in ends:
+                values = expected.copy()
+                values[slice(None) if cells is None else cells] = end
+                found.append(Variation(with_parameters(material, {parameter: values}), {parameter: values}, cells))
+        return found
+
+    def basis(self, tangents: Sequence[FactoredTangent], linear: Sequence[Floats], own: Floats) -> Floats:
         """Orthonormal displacements, (3n, r).
 
         Args:
-            tangent: of the body at rest.
-            linear: responses to typical loads, (m, 3n), metres.
+            tangents: of the body at rest: as it is expected, and with each of the other tissues.
+            linear: responses of each to typical loads, (m, 3n), metres.
             own: equilibria, (s, n, 3), metres.
         """
-        sizes = np.linalg.norm(linear, axis=1, keepdims=True)
-        modes = leading_modes(linear / np.sqrt(np.maximum(sizes, 1e-300)), self.modes)
-        spread = np.sqrt(np.square(linear @ modes).mean(axis=0))
-        curved = modal_derivatives(tangent, modes[:, : self.curved] * spread[: self.curved])
-        found = _joined(modes, leading_modes(without(curved, modes), self.derivatives))
+        others = len(tangents) - 1
+        pairs = [self._modes(*pair) for pair in zip(tangents, linear, strict=True)]
+        modes, curved = pairs[0][0], np.concatenate([each[1] for each in pairs])
+        found = modes
+        if others:
+            apart = [without(fields / _root_sizes(fields), modes) for fields in linear[1:]]
+            found = _joined(found, leading_modes(np.concatenate(apart), _MODES_MORE * others))
+        count = self.derivatives + (_DERIVATIVES_MORE * others if self.derivatives else 0)
+        found = _joined(found, leading_modes(without(curved, found), count))
         if self.own and len(own):
-            added = [without(fields, found) for fields in self._own_fields(tangent, modes * spread, own)]
+            spread = np.sqrt(np.square(linear[0] @ modes).mean(axis=0))
+            added = [without(fields, found) for fields in self._own_fields(tangents[0], modes * spread, own)]
             scaled = [fields / max(float(np.linalg.norm(fields)), 1e-300) for fields in added]
             found = _joined(found, leading_modes(np.concatenate(scaled), self.own))
         return found
 
+    def _modes(self, tangent: FactoredTangent, linear: Floats) -> tuple[Floats, Floats]:
+        """Linear modes, (3n, m), and the modal derivatives of the first of them, (d, 3n)."""
+        modes = leading_modes(linear / _root_sizes(linear), self.modes)
+        spread = np.sqrt(np.square(linear @ modes).mean(axis=0))
+        return modes, modal_derivatives(tangent, modes[:, : self.curved] * spread[: self.curved])
+
     def _own_fields(self, tangent: FactoredTangent, modes: Floats, own: Floats) -> tuple[Floats, Floats]:
         """Equilibria, (s, 3n), and small changes of them under the forces of linear modes, (m, 3n)."""
         flat = own.reshape(len(own), -1)
-        scale = 1.0 / np.sqrt(np.maximum(np.linalg.norm(flat, axis=1), 1e-300))
         at_rest = tangent.elastic.stiffness(torch.zeros(tangent.elastic.nodes, 3, dtype=torch.float64))
         forces = at_rest @ modes[:, : self.curved]
         changes = [FactoredTangent(tangent.elastic, state).inverse(forces).T for state in own[:_TANGENTS]]
-        return flat * scale[:, None], np.concatenate(changes)
+        return flat / _root_sizes(flat), np.concatenate(changes)
 
     def _network(
-        self, law: str, elastic: ElasticBody, basis: Floats, linear: Floats, own: Floats, extent: float
+        self,
+        law: str,
+        elastic: ElasticBody,
+        basis: Floats,
+        states: Sequence[Floats],
+        variations: Sequence[Variation],
     ) -> GalerkinNetwork:
         slopes, weights = slopes_of(elastic, basis), elastic.volumes.reshape(-1)
         points = elastic.volumes.shape[1]
@@ -142,20 +219,47 @@ class Galerkin:
             name: getattr(elastic, f"parameter_{name}").expand(len(elastic.volumes), points).reshape(-1)
             for name in elastic.material.parameters
         }
-        whole = GalerkinNetwork(law, parameters, slopes, weights, support_of(elastic, basis))
-        states = np.concatenate([_warped(elastic, linear, extent), own.reshape(len(own), -1)])
-        shares = _sketched([whole.shares(torch.from_numpy(state @ basis)) for state in states])
-        taken, factors, _ = sparse_weights(shares, self.tolerance, self.cells)
+        cells = torch.arange(len(elastic.volumes)).repeat_interleave(points)
+        whole = GalerkinNetwork(law, parameters, slopes, weights, support_of(elastic, basis), cells)
+        parts = [whole.shares(torch.from_numpy(state @ basis)) for state in states[0]]
+        for each, fields in zip(variations, states[1:], strict=True):
+            changed = whole.with_parameters(each.parameters)
+            for state in fields:
+                share = changed.shares(torch.from_numpy(state @ basis))
+                parts.append(share)
+                if each.cells is not None:  # a structure's own part is kept, too, however small it is beside the body's
+                    inside = share * np.isin(cells.numpy(), each.cells)
+                    parts.append(inside * (_INSIDE / max(float(np.linalg.norm(inside.sum(axis=1))), 1e-300)))
+        most = self.cells + _CELLS_MORE * len(variations)
+        taken, factors, _ = sparse_weights(_sketched(parts), self.tolerance, most)
         chosen = torch.from_numpy(taken)
-        own_parameters = {name: values[chosen] for name, values in parameters.items()}
         return GalerkinNetwork(
-            law, own_parameters, slopes[chosen], weights[chosen] * torch.from_numpy(factors), whole.support
+            law,
+            {name: values[chosen] for name, values in parameters.items()},
+            slopes[chosen],
+            weights[chosen] * torch.from_numpy(factors),
+            whole.support,
+            cells[chosen],
         )
 
     @staticmethod
     def from_state_dict(tensors: Mapping[str, Tensor]) -> GalerkinNetwork:
         """The network from what its `state_dict` was."""
         return GalerkinNetwork.from_state_dict(tensors)
+
+
+def varied(name: str, body: Body) -> tuple[str, Ints | None]:
+    """The parameter of the law that a name stands for, and the cells where it is meant; None for all.
+
+    Raises:
+        ValueError: no such structure.
+    """
+    kind, _, place = name.partition("@")
+    if not place:
+        return _VARIED[kind], None
+    from softtwin.meshes.signed import cells_inside  # VTK: prediction on a machine without it never comes here
+
+    return _VARIED[kind], cells_inside(body, place)
 
 
 def typical_loads(data: DataSet, train: Samples) -> Floats:
@@ -209,6 +313,11 @@ def _sketched(parts: list[Floats]) -> Floats:
     for number, part in enumerate(parts):
         found[number % groups] += rng.choice([-1.0, 1.0], size=(size, 1)) * part
     return found.reshape(-1, parts[0].shape[1])
+
+
+def _root_sizes(fields: Floats) -> Floats:
+    """Roots of the fields' norms, (m, 1): what is divided by them counts by its size, not by its square."""
+    return np.sqrt(np.maximum(np.linalg.norm(fields, axis=1, keepdims=True), 1e-300))
 
 
 def _joined(modes: Floats, more: Floats) -> Floats:

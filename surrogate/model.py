@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -15,6 +15,7 @@ from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.discrepancy import Discrepancy
+from softtwin.reference.data.inputs import Change, Inputs
 from softtwin.reference.data.loading import checked_array
 from softtwin.reference.data.springs import Support, springs_of
 
@@ -34,16 +35,24 @@ class SurrogateState:
         coordinates: of the load, that the network takes, (d,).
         linear: linear part of the displacement, (3n,), metres.
         near: the network at a load nearby, if one is known.
+        network: for another tissue than the surrogate's own, where there is one.
+        tissue_ratio: how far out that tissue lies, 1 at the ends of what the surrogate knows.
     """
 
     negative_pivots: int | None = None  # a network has no tangent to count them of
 
     def __init__(
-        self, surrogate: Surrogate, coordinates: Floats, linear: Floats, near: Linearisation | None = None
+        self,
+        surrogate: Surrogate,
+        coordinates: Floats,
+        linear: Floats,
+        near: Linearisation | None = None,
+        network: Network | None = None,
+        tissue_ratio: float = 0.0,
     ) -> None:
         encoder_decoder = surrogate.encoder_decoder
-        self._surrogate, self.coordinates = surrogate, coordinates
-        self.inner = surrogate.network.linearised(torch.from_numpy(coordinates), near)
+        self._surrogate, self.coordinates, self.tissue_ratio = surrogate, coordinates, tissue_ratio
+        self.inner = (network or surrogate.network).linearised(torch.from_numpy(coordinates), near)
         self.displacement: Floats = (
             encoder_decoder.offset + linear + encoder_decoder.decoded(self.inner.values.numpy())
         ).reshape(-1, 3)
@@ -64,13 +73,14 @@ class SurrogateState:
     def extrapolation_ratio(self) -> float | None:
         """How far the load lies out: 1 at the farthest load of the training; None where that was not measured.
 
-        The larger of `distance` and of the largest displacement of a node, relative to the largest of the training.
+        The largest of `distance`, of the largest displacement of a node, relative to the largest of the training, and
+        of how far out the tissue lies.
         """
         far = self.distance
         if far is None:
             return None
         moved = np.sqrt(np.einsum("ni,ni->n", self.displacement, self.displacement).max())
-        return float(max(far, moved / self._surrogate.card["domain"]["displacement_m"]))
+        return float(max(far, moved / self._surrogate.card["domain"]["displacement_m"], self.tissue_ratio))
 
     @property
     def is_inside(self) -> bool | None:
@@ -86,6 +96,28 @@ class SurrogateState:
         """
         linear, encoded = self._surrogate.linear_jvp(changes)
         return linear + self._surrogate.encoder_decoder.decoded(tangent(self.inner, encoded))
+
+    def jvp_inputs(self, changes: Sequence[Change]) -> Floats:
+        """Change of the displacement, (3n, k), for k changes of forces and parameters of the tissue.
+
+        Raises:
+            ValueError: prescribed displacements or springs that change, which a surrogate has learned one of;
+                parameters that the law does not have.
+        """
+        found = np.zeros((self.displacement.size, len(changes)))
+        for place, change in enumerate(changes):
+            if change.displacement is not None or change.springs:
+                raise ValueError(
+                    "SurrogateState.jvp_inputs: expected forces and parameters of the tissue, got displacements or "
+                    "springs; the reference knows them (--model reference)."
+                )
+            if change.forces is not None:
+                forces = np.asarray(change.forces, dtype=np.float64).reshape(-1, 1)
+                found[:, place] += self.jvp(forces)[:, 0]
+            if change.parameters:
+                values = self.inner.jvp_parameters(change.parameters).numpy()  # type: ignore[attr-defined]
+                found[:, place] += self._surrogate.encoder_decoder.decoded(values)
+        return found
 
     def vjp(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3): J^T g, zero at nodes that never carry load.
@@ -172,22 +204,51 @@ class Surrogate:
         )
         return None if modes is None or rest is None or not known else Discrepancy(modes, rest, known["places"])
 
-    def solve(self, forces: ArrayLike, near: Any = None) -> SurrogateState:
+    @property
+    def takes_inputs(self) -> bool:
+        """Whether states can be asked for with another tissue than the one that was learned."""
+        return type(self.network).with_parameters is not Network.with_parameters
+
+    def solve(self, forces: ArrayLike, near: Any = None, inputs: Inputs | None = None) -> SurrogateState:
         """The state under nodal forces, (n, 3) newtons.
 
         Args:
             forces: nodal forces, (n, 3), newtons.
             near: a state of this surrogate under a load nearby; networks that look for their values begin there.
+            inputs: another tissue, for networks that take one, and more forces.
 
         Raises:
             ValueError: another shape, numbers that are not finite, or forces at nodes that the surrogate never saw
-                loaded. Forces at fixed nodes move nothing and are let pass.
+                loaded. Forces at fixed nodes move nothing and are let pass. Inputs that it has learned one value of.
         """
         load = checked_array("Surrogate.forces", forces, self.body.points.shape)
+        network = self.network
+        if inputs is not None:
+            if inputs.displacement or any(factor != 1.0 for factor in inputs.springs.values()):
+                raise ValueError(
+                    "Surrogate.inputs: expected a tissue and forces, got displacements or springs, of which it has "
+                    "learned one; the reference knows others (--model reference)."
+                )
+            if inputs.forces is not None:
+                load = load + inputs.forces
+            if inputs.parameters:
+                network = network.with_parameters(inputs.parameters)
         self._refuse_idle("forces", np.abs(load).max(axis=1))
         loads = load.ravel()[self.rows]
         start = near.inner if isinstance(near, SurrogateState) else None
-        return SurrogateState(self, self.encoder_decoder.encoded(loads), self.encoder_decoder.linear(loads), start)
+        encoded, linear = self.encoder_decoder.encoded(loads), self.encoder_decoder.linear(loads)
+        return SurrogateState(self, encoded, linear, start, network, self._tissue_ratio(inputs))
+
+    def _tissue_ratio(self, inputs: Inputs | None) -> float:
+        """How far out a tissue lies, 1 at the ends of the ranges that the surrogate was made for."""
+        worst = 0.0
+        for name, (low, high) in self.card.get("plan", {}).get("vary", {}).items():
+            parameter = name.partition("@")[0].replace("-", "_")
+            if inputs is None or parameter not in inputs.parameters:
+                continue
+            values = np.asarray(inputs.parameters[parameter], dtype=np.float64)
+            worst = max(worst, float(np.abs(values - 0.5 * (low + high)).max()) / (0.5 * (high - low)))
+        return worst
 
     def propose(self, forces: ArrayLike, linear: Floats | None = None) -> Floats:
         """The displacement alone, (n, 3), metres, in single precision and half of the time: for Newton to start from.

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from softtwin.reference.data.materials import MATERIALS, Material
@@ -44,6 +44,7 @@ class GalerkinNetwork(Network):
         slopes: gradients of the modes in the cells that are taken, (p, 9, r), 1/m.
         weights: volume that each of them stands for, (p,), m^3.
         support: stiffness of what holds the body and gives way, between modes, (r, r), N/m.
+        cells: number of the body's cell that each of them lies in, (p,).
     """
 
     is_graph = False
@@ -51,15 +52,23 @@ class GalerkinNetwork(Network):
     weights: Tensor
     support: Tensor
     law: Tensor
+    cells: Tensor
     at_rest: Tensor
 
     def __init__(
-        self, law: str, parameters: Mapping[str, Tensor], slopes: Tensor, weights: Tensor, support: Tensor
+        self,
+        law: str,
+        parameters: Mapping[str, Tensor],
+        slopes: Tensor,
+        weights: Tensor,
+        support: Tensor,
+        cells: Tensor,
     ) -> None:
         super().__init__()
         self.register_buffer("slopes", slopes.contiguous())
         self.register_buffer("weights", weights)
         self.register_buffer("support", support)
+        self.register_buffer("cells", cells)
         self.register_buffer("law", torch.tensor(list(law.encode()), dtype=torch.uint8))
         for name, values in parameters.items():
             self.register_buffer(f"{_PARAMETER}{name}", values)
@@ -76,6 +85,50 @@ class GalerkinNetwork(Network):
         other = copy.copy(self)
         other.is_exact = False
         return other
+
+    def with_parameters(self, values: Mapping[str, ArrayLike]) -> GalerkinNetwork:
+        """The same of other parameters of the law; what is corrected stays the linear response of its own.
+
+        Args:
+            values: a number, or one for each cell of the body, by the parameters' names; others stay.
+
+        Raises:
+            ValueError: a parameter that the law does not have.
+        """
+        found = {f"{_PARAMETER}{name}": self._in_points(name, value) for name, value in values.items()}
+        other = copy.copy(self)
+        other._buffers = {**self._buffers, **found}
+        return other
+
+    def _in_points(self, name: str, value: ArrayLike) -> Tensor:
+        """A parameter, or its change, in the cells that are taken, (p,) or (1,)."""
+        if name not in self.parameters_of_law:
+            raise ValueError(
+                f"GalerkinNetwork.{name}: expected parameters among {sorted(self.parameters_of_law)}, got another one."
+            )
+        given = np.asarray(value, dtype=np.float64)
+        return torch.from_numpy(given.reshape(1) if given.ndim == 0 else given[self.cells.numpy()]).to(self.slopes)
+
+    def forces_by_parameters(self, q: Tensor, changes: Mapping[str, ArrayLike]) -> Tensor:
+        """Change of the internal forces along the modes, (r,), newtons, as parameters change.
+
+        Args:
+            q: coordinates of the displacement, (r,).
+            changes: a number, or one for each cell of the body, by the parameters' names.
+        """
+        known, F, count = self.parameters_of_law, self.gradients(q), len(self.slopes)
+        ways = {name: torch.zeros_like(values) for name, values in known.items()}
+        ways |= {name: self._in_points(name, value) for name, value in changes.items()}
+        at = {name: values.expand(count).clone() for name, values in known.items()}
+        along = {name: values.expand(count).clone() for name, values in ways.items()}
+
+        def stress(parameters: dict[str, Tensor]) -> Tensor:
+            algebra = JetAlgebra(1)
+            found: Jet = self._law.energy(algebra.variable(F), None, SimpleNamespace(**parameters), algebra)
+            return found.first.expand(count, 9)
+
+        pushed = torch.func.jvp(stress, (at,), (along,))[1]
+        return self.flat.mT @ (pushed * self.weights[:, None]).reshape(-1)
 
     def forward(self, coordinates: Tensor) -> Tensor:
         """Corrections for coordinates of loads, one after the other.
@@ -96,7 +149,7 @@ class GalerkinNetwork(Network):
             NotConverged: no equilibrium was found.
         """
         load = coordinates.to(self.slopes)
-        start = near if isinstance(near, GalerkinState) and near.network.slopes is self.slopes else None
+        start = near if isinstance(near, GalerkinState) and near.q.shape == load.shape else None
         return GalerkinState(self, load, *_Search(self, load).found(start))
 
     @staticmethod
@@ -104,7 +157,7 @@ class GalerkinNetwork(Network):
         """The network from what its `state_dict` was."""
         law = bytes(tensors["law"].tolist()).decode()
         parameters = {n.removeprefix(_PARAMETER): v for n, v in tensors.items() if n.startswith(_PARAMETER)}
-        return GalerkinNetwork(law, parameters, tensors["slopes"], tensors["weights"], tensors["support"])
+        return GalerkinNetwork(law, parameters, *(tensors[n] for n in ("slopes", "weights", "support", "cells")))
 
     def shares(self, q: Tensor) -> Floats:
         """Of each cell in the forces along the modes, (r, p), in the energy norm at rest, as shares of a force of one.
@@ -284,3 +337,8 @@ class GalerkinState:
     def vjp(self, cotangent: Tensor) -> Tensor:
         """Gradient with respect to the coordinates, (r,), for one with respect to the values, (r,): symmetric."""
         return self.jvp(cotangent[:, None])[:, 0]
+
+    def jvp_parameters(self, changes: Mapping[str, ArrayLike]) -> Tensor:
+        """Change of the values, (r,), as parameters of the law change: see `GalerkinNetwork.forces_by_parameters`."""
+        forces = self.network.forces_by_parameters(self.q, changes)
+        return -torch.cholesky_solve(forces[:, None], self._tangent)[:, 0]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+from softtwin.surrogate.galerkin import Galerkin
 from softtwin.surrogate.physics import Physics
 from softtwin.surrogate.plan import Device, TrainingPlan
 from softtwin.surrogate.reduced import Reduced
@@ -29,7 +30,9 @@ def training_plan(section: TrainingSection, device: Device = "auto", processes: 
         ValueError: a GPU is asked for and there is none; fewer GPUs than processes.
     """
     kind: Any = ARCHITECTURES[section.architecture]
-    own = {"modes": section.modes, "width": section.width} if kind is Reduced else {}
+    own: dict[str, Any] = {"modes": section.modes, "width": section.width} if kind is Reduced else {}
+    if kind is Galerkin:
+        own = {"vary": section.vary}
     physics = _built("training.physics", Physics, section.physics) if section.physics else None
     plan = TrainingPlan(
         architecture=_built("training.settings", kind, {**own, **section.settings}),

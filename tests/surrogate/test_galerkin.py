@@ -5,28 +5,34 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from softtwin.meshes.body import Body
+from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.shapes import beam
+from softtwin.meshes.signed import cells_inside
 from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.inputs import Change, Inputs
 from softtwin.reference.data.materials import MATERIALS, MooneyRivlin, NeoHookean
 from softtwin.reference.data.outcome import NotConverged
 from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.data.springs import Ligament, Springs
 from softtwin.surrogate.algebra import TorchAlgebra
 from softtwin.surrogate.cubature import sparse_weights
+from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.equilibria import Equilibria
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.export import export
 from softtwin.surrogate.galerkin import Galerkin, slopes_of, support_of, typical_loads
 from softtwin.surrogate.jets import JetAlgebra
 from softtwin.surrogate.modal_derivatives import FactoredTangent, leading_modes, modal_derivatives, without
+from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.physics import Physics
 from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.reduced_equilibria import GalerkinNetwork
 from softtwin.surrogate.residual import ElasticBody
 from softtwin.surrogate.train import train
@@ -136,9 +142,9 @@ def whole_span(body: Body, law: str, springs: dict[str, Springs] | None = None) 
     names = elastic.material.parameters
     parameters = {name: getattr(elastic, f"parameter_{name}").reshape(-1) for name in names}
     kind = next(name for name, each in MATERIALS.items() if type(LAWS[law]) is each)
-    return GalerkinNetwork(
-        kind, parameters, slopes_of(elastic, basis), elastic.volumes.reshape(-1), support_of(elastic, basis)
-    )
+    cells = torch.arange(len(elastic.volumes)).repeat_interleave(elastic.volumes.shape[1])
+    weights = elastic.volumes.reshape(-1)
+    return GalerkinNetwork(kind, parameters, slopes_of(elastic, basis), weights, support_of(elastic, basis), cells)
 
 
 KNOWN = [law for law in LAWS if type(LAWS[law]) in MATERIALS.values()]
@@ -291,3 +297,112 @@ def test_settings_out_of_range_are_refused() -> None:
     plane = Body(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.array([[0, 1, 2]]), {"fixed": np.array([0, 1])})
     with pytest.raises(ValueError, match="a body in space"):
         Galerkin().check(plane)
+
+
+# ---------------------------------------------------------------------- with another tissue
+
+
+def _ball(points: np.ndarray, radius: float) -> Surface:
+    """An octahedron around the middle of a body."""
+    middle = points.mean(axis=0)
+    corners = middle + radius * np.concatenate([np.eye(3), -np.eye(3)])
+    faces = [(i, j, k) for i in (0, 3) for j in (1, 4) for k in (2, 5)]
+    turned = [face if np.linalg.det(corners[list(face)] - middle) > 0 else face[::-1] for face in faces]
+    return Surface(corners, np.array(turned))
+
+
+@pytest.fixture(scope="module")
+def varied(data: DataSet, tmp_path_factory: pytest.TempPathFactory) -> tuple[DataSet, Surrogate]:
+    from softtwin.reference.generate import Plan, generate
+
+    body = replace(data.body, inner={"lump": _ball(data.body.points, 0.09)})
+    plan = Plan(loads=LoadPlan(modes=6, displacement=0.15), samples=PLAN_SAMPLES, block=4)
+    made = generate(tmp_path_factory.mktemp("varied") / "data.zarr", body, plan)
+    assert made is not None
+    return made, train(made, TrainingPlan(replace(SMALL, vary=VARY)))
+
+
+VARY = {"poisson-ratio": (0.38, 0.48), "young-modulus@lump": (5e3, 4e4)}
+
+
+def _tissue(data: DataSet, ratio: float, modulus: float) -> dict[str, Any]:
+    moduli = np.full(len(data.body.cells), 5e3)
+    moduli[cells_inside(data.body, "lump")] = modulus
+    return {"poisson_ratio": ratio, "young_modulus": moduli}
+
+
+@pytest.mark.fenicsx
+def test_states_are_those_of_another_tissue(varied: tuple[DataSet, Surrogate]) -> None:
+    data, surrogate = varied
+    missed, unlike = [], []
+    for number, (ratio, modulus) in enumerate(((0.39, 3e4), (0.475, 3e4), (0.47, 6e3))):
+        tissue = _tissue(data, ratio, modulus)
+        forces = np.zeros_like(data.body.points)
+        forces[data.response.loaded] = data.samples("test").forces[number]
+        exact = Equilibria(data.body, NeoHookean(tissue["young_modulus"], ratio)).solve(forces[None])
+        truth = exact.displacement[0].numpy()
+        found = surrogate.solve(forces, inputs=Inputs(parameters=tissue)).displacement
+        missed.append(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+        unlike.append(np.linalg.norm(surrogate.solve(forces).displacement - truth) / np.linalg.norm(truth))
+    assert max(missed) < 0.03 and np.median(missed) < 0.015
+    assert np.median(unlike) > 3.0 * np.median(missed)
+
+
+@pytest.mark.fenicsx
+def test_its_derivatives_by_the_tissue_are_those_of_differences(varied: tuple[DataSet, Surrogate]) -> None:
+    data, surrogate = varied
+    forces = np.zeros_like(data.body.points)
+    forces[data.response.loaded] = data.samples("test").forces[0]
+    at = _tissue(data, 0.44, 2e4)
+    inside = np.isin(np.arange(len(data.body.cells)), cells_inside(data.body, "lump"))
+    changes = [Change(parameters={"poisson_ratio": 1e-3}), Change(parameters={"young_modulus": 200.0 * inside})]
+    changes.append(Change(forces=0.01 * forces, parameters={"poisson_ratio": 5e-4}))
+    state = surrogate.solve(forces, inputs=Inputs(parameters=at))
+    for change, pushed in zip(changes, state.jvp_inputs(changes).T, strict=True):
+        ends = []
+        for sign in (1.0, -1.0):
+            values = {
+                name: np.asarray(v) + sign * np.asarray(change.parameters.get(name, 0.0)) for name, v in at.items()
+            }
+            load = forces if change.forces is None else forces + sign * np.asarray(change.forces)
+            ends.append(surrogate.solve(load, inputs=Inputs(parameters=values)).displacement.ravel())
+        difference = 0.5 * (ends[0] - ends[1])
+        np.testing.assert_allclose(pushed, difference, rtol=0.0, atol=2e-3 * np.abs(difference).max())
+        assert np.abs(difference).max() > 1e-6
+
+
+@pytest.mark.fenicsx
+def test_how_far_out_a_tissue_lies_is_said(varied: tuple[DataSet, Surrogate]) -> None:
+    data, surrogate = varied
+    known = with_domain(surrogate, data)
+    forces = np.zeros_like(data.body.points)
+    inside = known.solve(forces, inputs=Inputs(parameters=_tissue(data, 0.47, 2e4))).extrapolation_ratio
+    beyond = known.solve(forces, inputs=Inputs(parameters=_tissue(data, 0.495, 2e4))).extrapolation_ratio
+    assert inside is not None and beyond is not None and inside <= 1.0 < beyond
+
+
+@pytest.mark.fenicsx
+def test_a_tissue_that_it_cannot_be_is_refused(varied: tuple[DataSet, Surrogate], data: DataSet) -> None:
+    _, surrogate = varied
+    forces = np.zeros_like(surrogate.body.points)
+    with pytest.raises(ValueError, match=r"parameters among \['poisson_ratio', 'young_modulus'\]"):
+        surrogate.solve(forces, inputs=Inputs(parameters={"c1": 3.0}))
+    with pytest.raises(ValueError, match="displacements or springs"):
+        surrogate.solve(forces, inputs=Inputs(springs={"end": 2.0}))
+    with pytest.raises(ValueError, match="displacements or springs"):
+        surrogate.solve(forces).jvp_inputs([Change(springs={"end": 2.0})])
+    network = train(data, TrainingPlan(Reduced(modes=4, width=8, depth=1), epochs=1))
+    assert not network.takes_inputs and surrogate.takes_inputs
+    with pytest.raises(ValueError, match="the galerkin architecture takes them"):
+        network.solve(forces, inputs=Inputs(parameters={"poisson_ratio": 0.4}))
+    for wrong, words in (
+        ({"density": (1.0, 2.0)}, "expected poisson-ratio, young-modulus or"),
+        ({"poisson-ratio@lump": (0.4, 0.45)}, "expected poisson-ratio, young-modulus or"),
+        ({"poisson-ratio": (0.48, 0.4)}, "two growing positive numbers"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            Galerkin(vary=wrong)
+    with pytest.raises(ValueError, match=r"holds what the tissue has, 0\.45 to 0\.45"):
+        train(data, TrainingPlan(replace(SMALL, vary={"poisson-ratio": (0.3, 0.4)})))
+    with pytest.raises(ValueError, match="expected an inner surface"):
+        train(data, TrainingPlan(replace(SMALL, vary={"young-modulus@nothing": (1e3, 1e4)})))
