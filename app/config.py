@@ -298,7 +298,6 @@ class TrainingSection(Section):
         "reduced network; galerkin: equilibria in the span of a few modes, which takes a tenth of the equilibria and "
         "learns nothing; as yardsticks the thesis's perceptron (mlp) and U-Mesh (umesh, on a regular grid), and a "
         "transolver",
-        basic=True,
     )
     modes: int = option(64, "displacement modes (POD) of the reduced network", ge=1)
     width: int = option(256, "width of its blocks", ge=1)

@@ -15,13 +15,13 @@ _BATCH = 4  # cells that are taken at a time
 _RIDGE = 1e-13  # of the mean square of a column, for columns that are nearly alike
 
 
-def sparse_weights(shares: Floats, tolerance: float, most: int) -> tuple[Ints, Floats, float]:
+def sparse_weights(shares: Floats, tolerance: float, maximum: int) -> tuple[Ints, Floats, float]:
     """Cells with weights that are not negative, whose weighted shares make the sum of all.
 
     Args:
         shares: of each cell in each figure that is to be kept, (f, cells).
         tolerance: of what is missing, relative to the sum, in the Euclidean norm.
-        most: cells, about.
+        maximum: number of cells, but for the last few.
 
     Returns:
         Numbers of the cells, (c,), their weights, (c,), and what is missing, relative to the sum.
@@ -33,7 +33,7 @@ def sparse_weights(shares: Floats, tolerance: float, most: int) -> tuple[Ints, F
     products = np.zeros((0, 0))
     right = shares.T @ wanted
     missing = wanted.copy()
-    while np.linalg.norm(missing) > tolerance * size and len(active) < most:
+    while np.linalg.norm(missing) > tolerance * size and len(active) < maximum:
         promise = shares.T @ missing
         promise[active] = -np.inf
         new = np.argsort(promise)[::-1][:_BATCH]

@@ -60,10 +60,10 @@ def stiffness_changes(elastic: ElasticBody, mode: Floats, fields: Floats) -> Flo
     return found.index_add(0, elastic.cells.reshape(-1), shares).reshape(fields.shape).numpy() / (2.0 * step)
 
 
-def leading_modes(fields: Floats, most: int) -> Floats:
-    """Orthonormal proper orthogonal modes of fields, (m, 3n): (3n, r) with r at most `most`, the largest first."""
+def leading_modes(fields: Floats, maximum: int) -> Floats:
+    """Orthonormal proper orthogonal modes of fields, (m, 3n): (3n, r) with r at most `maximum`, the largest first."""
     values, vectors = np.linalg.eigh(fields @ fields.T)
-    order = np.argsort(values)[::-1][:most]
+    order = np.argsort(values)[::-1][:maximum]
     order = order[values[order] > _NOTHING * max(float(values.max(initial=0.0)), 1e-300)]
     return np.linalg.qr(fields.T @ (vectors[:, order] / np.sqrt(values[order])))[0]
 
