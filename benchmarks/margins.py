@@ -2,6 +2,7 @@
 
     softtwin quickstart --output FOLDER
     python benchmarks/margins.py FOLDER [--loads 200] [--only surrogate ...]
+    python benchmarks/margins.py FOLDER --name margins_galerkin    # a folder trained with architecture = "galerkin"
 
 States of the quickstart's organ under loads of its kind that no data set holds, solved by the reference; clouds of
 1,000 points from the quickstart's camera, no zone told, from rest. One row has another Poisson's ratio than the twin.
@@ -164,6 +165,7 @@ BENCHMARK = Benchmark(
     about=("registration", "surrogate", "reference"),
     work=work,
     rows=tuple(f"{engine}, {label}" for label in ROWS for engine in ("surrogate", "hybrid")),
+    also=("margins_galerkin",),
     columns=(
         Column("error; predicted", "mm", "{error_mm:.2f}; {predicted_mm:.2f}"),
         Column("r; at best", "", "{correlation:.2f}; {correlation_at_best:.2f}"),

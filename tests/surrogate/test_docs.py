@@ -45,9 +45,10 @@ def test_the_guide_runs(data: DataSet, closed_form: Any, tmp_path: Path, capsys,
 
 
 def test_the_configurations_are_such() -> None:
-    training, smooth, rounds, spread = (
+    varied, training, smooth, rounds, spread = (
         parse_config(tomllib.loads(b)) for b in re.findall(r"```toml\n(.*?)```", TEXT, flags=re.S)
     )
+    assert varied.training.vary["poisson-ratio"] == (0.40, 0.49)
     assert training.training.physics == {"energy": 0.1}
     assert smooth.samples.smooth == 64
     assert (rounds.samples.rounds, rounds.samples.chosen, rounds.samples.candidates) == (6, 256, 16)
