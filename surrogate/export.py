@@ -37,6 +37,9 @@ class Value(nn.Module):
         surrogate: what predicts.
         basis: forces at the loaded nodes for unit coefficients, (3l, k), newtons.
         kind: precision of all, that of what is exported if not said.
+
+    Raises:
+        ValueError: a model that searches for its states.
     """
 
     offset: Tensor
@@ -46,6 +49,11 @@ class Value(nn.Module):
 
     def __init__(self, surrogate: Surrogate, basis: Floats, kind: torch.dtype = torch.float32) -> None:
         super().__init__()
+        if not surrogate.network.is_graph:
+            raise ValueError(
+                f"Value.surrogate: expected a network, got {surrogate.card.get('architecture', 'a model')}, which "
+                "searches for equilibria and is no graph; train a network (architecture reduced)."
+            )
         encoder_decoder = surrogate.encoder_decoder
         self.network = copy.deepcopy(surrogate.network).to(kind).requires_grad_(False)
         for name, values in (
@@ -134,11 +142,6 @@ def export(surrogate: Surrogate, folder: Path | str, directions: int = 64) -> Pa
     folder = Path(folder)
     if folder.exists() and not (folder / MANIFEST).exists():
         raise ValueError(f"export.folder: expected none, or one that was exported before, got {folder}.")
-    if not surrogate.network.is_graph:
-        raise ValueError(
-            f"export.surrogate: expected a network, got {surrogate.card.get('architecture', 'one')} that searches for "
-            "equilibria, which no graph does; train one (architecture reduced)."
-        )
     _need_onnx()
     basis = leading_directions(surrogate, directions)
     inputs = 3 * len(surrogate.encoder_decoder.loaded)

@@ -26,6 +26,7 @@ from softtwin.surrogate.domain import with_domain
 from softtwin.surrogate.equilibria import Equilibria
 from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.export import export
+from softtwin.surrogate.fast import FastSurrogate
 from softtwin.surrogate.galerkin import Galerkin, slopes_of, support_of, typical_loads
 from softtwin.surrogate.jets import JetAlgebra
 from softtwin.surrogate.modal_derivatives import FactoredTangent, leading_modes, modal_derivatives, without
@@ -264,8 +265,10 @@ def test_it_is_saved_and_read_as_it_was(data: DataSet, tmp_path) -> None:
     assert read.card["architecture"] == "galerkin" and read.card["training"]["steps"] == 0
     near = made.propose(forces)
     np.testing.assert_allclose(near, made.solve(forces).displacement, atol=1e-6 * np.abs(near).max())
-    with pytest.raises(ValueError, match="galerkin"):
-        export(made, tmp_path / "graphs")
+    for as_graph in (lambda: export(made, tmp_path / "graphs"), lambda: FastSurrogate(made, "cpu")):
+        with pytest.raises(ValueError, match="got galerkin, which searches for equilibria and is no graph"):
+            as_graph()
+    assert not (tmp_path / "graphs").exists()
 
 
 @pytest.mark.fenicsx
