@@ -15,6 +15,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
+import design_a_phantom
 import follow_a_stream
 import numpy as np
 import own_forward_model
@@ -30,6 +31,7 @@ EXAMPLES = {
     "own_forward_model",
     "own_simulator",
     "train_through_equilibria",
+    "design_a_phantom",
     "run_exported_graphs",
     "openigtlink_camera",
     "ros2_pointcloud",
@@ -72,6 +74,19 @@ def test_train_through_equilibria(capsys) -> None:
 
     assert train_through_equilibria.main() < 0.1
     assert capsys.readouterr().out.count("% off") == 5
+
+
+def test_design_a_phantom(tmp_path: Path, capsys) -> None:
+    """The stiffness that was asked for, and the derivative that led there, which differences agree with."""
+    tumour, strain = design_a_phantom.main(tmp_path / "design.png")
+    assert strain == pytest.approx(design_a_phantom.WANTED, abs=2 * design_a_phantom.CLOSE)
+    assert 1.5 * design_a_phantom.TISSUE < tumour < 20.0 * design_a_phantom.TISSUE
+    assert (tmp_path / "design.png").stat().st_size > 10_000
+    assert "found with" in capsys.readouterr().out
+    phantom = design_a_phantom.Phantom()
+    slope = phantom.slope(phantom.state(tumour), tumour)
+    ends = [phantom.strain(phantom.state(tumour * float(np.exp(step))).displacement) for step in (1e-3, -1e-3)]
+    assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-3)
 
 
 def test_run_exported_graphs(small_quickstart: Path, tmp_path: Path, capsys) -> None:
