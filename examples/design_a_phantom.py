@@ -98,10 +98,13 @@ def draw(phantom: Phantom, first: float, way: list[tuple[float, float]], picture
     curve = [phantom.strain(phantom.state(float(each)).displacement) / first for each in stiffness]
     figure = Figure(figsize=(5.0, 3.2), layout="constrained")
     axes = figure.subplots()
-    axes.semilogx(stiffness, curve, color="0.6", label="nine equilibria")
-    axes.plot(*np.transpose(way), "o-", label="Newton's steps")
+    axes.semilogx(1e-3 * stiffness, curve, color="0.6", label="nine equilibria")
+    axes.plot(*(np.transpose(way) * [[1e-3], [1.0]]), "o-", label="Newton's steps")
     axes.axhline(WANTED, color="k", linewidth=0.8, linestyle=":")
-    axes.set(xlabel="Young's modulus of the tumour, Pa", ylabel="strain of the tumour, relative")
+    ticks = [each for each in (1, 2, 3, 5, 10, 20, 30, 50) if stiffness[0] < 1e3 * each < stiffness[-1]]
+    axes.set_xticks(ticks, [str(each) for each in ticks])
+    axes.minorticks_off()
+    axes.set(xlabel="Young's modulus of the tumour, kPa", ylabel="strain of the tumour, relative")
     axes.legend(frameon=False)
     figure.savefig(picture, dpi=150)
     print(f"picture: {picture}")
