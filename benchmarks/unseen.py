@@ -217,24 +217,34 @@ def rows_of(given: Given) -> list[str]:
     return [*(f"family {number}" for number in range(given.organs)), *OTHERS]
 
 
-def lines(figures: Figures) -> Iterable[tuple[str, Figures]]:
-    """Organs of the family together, others one by one; a line for each way."""
-    groups = {"family": [row for name, row in figures.items() if name.startswith("family")]}
-    groups |= {name: [figures[name]] for name in OTHERS if name in figures}
+def summarised(figures: Figures, given: Given | None = None) -> Figures:
+    """Organs of the family together, others one by one: of each way, errors in percent, pooled over organs."""
+    organs = figures["organs"]
+    groups = {"family": [row for name, row in organs.items() if name.startswith("family")]}
+    groups |= {name: [organs[name]] for name in OTHERS if name in organs}
+    found: Figures = {}
     for group, rows in groups.items():
-        for way, label in LABELS.items():
-            found = [row["ways"][way] for row in rows if way in row["ways"]]
-            if not found:
-                continue
-            entry: Figures = {"organs": len(found), "ms": float(np.median([each["ms"] for each in found]))}
-            entry["seconds"] = float(np.median([each["seconds"] for each in found]))
-            for split in ("test", "smooth"):
-                pooled = 100.0 * np.concatenate([each[split] for each in found])
-                entry[split] = {"median": float(np.median(pooled)), "p95": float(np.percentile(pooled, 95))}
-            if way == "own":
-                kept = [row["bounds"]["kept"]["mean"] for row in rows]
-                entry["kept"] = {"mean": 100.0 * float(np.mean(kept)), "least": 100.0 * float(np.min(kept))}
-            yield f"{group}: {label}", entry
+        ways = {way: [row["ways"][way] for row in rows if way in row["ways"]] for way in LABELS}
+        found[group] = {way: _pooled(each) for way, each in ways.items() if each}
+        kept = [100.0 * row["bounds"]["kept"]["mean"] for row in rows]
+        if kept:
+            found[group]["own"]["kept"] = {"mean": float(np.mean(kept)), "least": float(np.min(kept))}
+    return {"summary": found}
+
+
+def _pooled(each: list[Figures]) -> Figures:
+    entry: Figures = {name: float(np.median([one[name] for one in each])) for name in ("ms", "seconds")}
+    for split in ("test", "smooth"):
+        errors = 100.0 * np.concatenate([one[split] for one in each])
+        entry[split] = {"median": float(np.median(errors)), "p95": float(np.percentile(errors, 95))}
+    return {"organs": len(each), **entry}
+
+
+def lines(organs: Figures) -> Iterable[tuple[str, Figures]]:
+    """A line for each group of organs and each way."""
+    for group, ways in summarised({"organs": organs})["summary"].items():
+        for way, entry in ways.items():
+            yield f"{group}: {LABELS[way]}", entry
 
 
 BENCHMARK = Benchmark(
@@ -259,6 +269,8 @@ BENCHMARK = Benchmark(
     },
     seeds=(0,),
     small={"organs": 1},
+    under="organs",
+    finish=summarised,
     lines=lines,
 )
 
