@@ -222,6 +222,8 @@ class Twin:
             found: a registration of this twin.
         """
         card: Any = getattr(self._fast or self.model, "card", {})
+        if self._fast is None and found.estimates:
+            return None  # bounds are of the tissue that was learned, and not of one that was estimated
         return self._certifier.bound_error((found.draft or found).forces) if card.get("certificate") else None
 
     @cached_property

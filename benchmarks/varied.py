@@ -54,9 +54,11 @@ def cases_of(folder: Any, count: int, is_stiffer: bool) -> list[Case]:
         forces = np.zeros_like(data.body.points)
         forces[data.response.loaded] = loads[number % len(loads)]
         state = Equilibria(data.body, NeoHookean(moduli, ratio)).solve(forces[None])
-        if bool(state.is_converged[0] & state.is_stable[0]) and len(found) < count:
+        if bool(state.is_converged[0] & state.is_stable[0]):
             tissue = {"poisson_ratio": ratio, "young_modulus": moduli}
             found.append((tissue, forces, state.displacement[0].numpy()))
+        if len(found) == count:
+            break
     return found
 
 

@@ -65,6 +65,10 @@ class Network(nn.Module):
             "the galerkin architecture takes them, and so do --model reference, torch and hybrid."
         )
 
+    def stiffening(self, values: Mapping[str, ArrayLike]) -> float:
+        """How many times as stiff as its own a tissue is, where that scales loads alone: 1 if it has learned one."""
+        return 1.0
+
     def rounded(self) -> Network:
         """The same, good to six digits, and faster."""
         return copy.deepcopy(self).float()

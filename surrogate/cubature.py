@@ -44,7 +44,9 @@ def sparse_weights(shares: Floats, tolerance: float, maximum: int) -> tuple[Ints
         active += new.tolist()
         weights = np.concatenate([weights, np.zeros(len(new))])
         active, weights, products = _least_squares(active, weights, products, right)
-        missing = wanted - shares[:, active] @ weights
+        before, missing = float(np.linalg.norm(missing)), wanted - shares[:, active] @ weights
+        if np.linalg.norm(missing) >= before:  # rounding leaves no more to gain
+            break
     return np.array(active, dtype=np.int64), weights, float(np.linalg.norm(missing)) / max(size, 1e-300)
 
 

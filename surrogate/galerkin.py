@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _VARIED = {"poisson-ratio": "poisson_ratio", "young-modulus": "young_modulus"}
 _MODES_MORE, _DERIVATIVES_MORE, _CELLS_MORE = 5, 6, 60  # for each tissue beside the expected one
+_NOTHING = 1e-8  # of fields, that what they have outside of a basis is more than
 _INSIDE = 0.3  # of a whole body's forces, that those of a structure count as
 _LOADS = 128  # typical loads, that nothing is solved for but linear responses
 _LEAST_SHARE = 0.2  # of the usual top, that the smallest of them are
@@ -82,11 +83,11 @@ class Galerkin:
 
     def __post_init__(self) -> None:
         for name in ("modes", "curved", "cells"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"Galerkin.{name}: expected at least 1, got {getattr(self, name)}.")
+            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
+                raise ValueError(f"Galerkin.{name}: expected a whole number of at least 1, got {getattr(self, name)}.")
         for name in ("derivatives", "own"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"Galerkin.{name}: expected at least 0, got {getattr(self, name)}.")
+            if not isinstance(getattr(self, name), int) or getattr(self, name) < 0:
+                raise ValueError(f"Galerkin.{name}: expected a whole number of at least 0, got {getattr(self, name)}.")
         if not 0.0 < self.tolerance < 1.0:
             raise ValueError(f"Galerkin.tolerance: expected a number between 0 and 1, got {self.tolerance}.")
         for name, ends in self.vary.items():
@@ -97,13 +98,17 @@ class Galerkin:
                 )
             if len(ends) != 2 or not 0.0 < ends[0] < ends[1] < np.inf:
                 raise ValueError(f"Galerkin.vary: expected two growing positive numbers for {name}, got {list(ends)}.")
+            if kind == "poisson-ratio" and ends[1] >= 0.5:
+                raise ValueError(f"Galerkin.vary: expected Poisson's ratios below 0.5, got {list(ends)}.")
 
     def check(self, body: Body) -> None:
-        """Any body in space will do.
+        """Any body in space will do that has the structures which `vary` names.
 
         Raises:
-            ValueError: a plane body.
+            ValueError: a plane body, or no such structure.
         """
+        for name in self.vary:
+            varied(name, body)
         if body.dimension != 3:
             raise ValueError(f"Galerkin.body: expected a body in space, got one of {body.dimension} dimensions.")
 
@@ -186,9 +191,14 @@ class Galerkin:
         found = _joined(found, leading_modes(without(curved, found), count))
         if self.own and len(own):
             spread = np.sqrt(np.square(linear[0] @ modes).mean(axis=0))
-            added = [without(fields, found) for fields in self._own_fields(tangents[0], modes * spread, own)]
-            scaled = [fields / max(float(np.linalg.norm(fields)), 1e-300) for fields in added]
-            found = _joined(found, leading_modes(np.concatenate(scaled), self.own))
+            scaled = []
+            for fields in self._own_fields(tangents[0], modes * spread, own):
+                outside = without(fields, found)
+                size = float(np.linalg.norm(outside))
+                if size > _NOTHING * float(np.linalg.norm(fields)):  # less is rounding's
+                    scaled.append(outside / size)
+            if scaled:
+                found = _joined(found, leading_modes(np.concatenate(scaled), self.own))
         return found
 
     def _modes(self, tangent: FactoredTangent, linear: Floats) -> tuple[Floats, Floats]:
@@ -202,7 +212,15 @@ class Galerkin:
         flat = own.reshape(len(own), -1)
         at_rest = tangent.elastic.stiffness(torch.zeros(tangent.elastic.nodes, 3, dtype=torch.float64))
         forces = at_rest @ modes[:, : self.curved]
-        changes = [FactoredTangent(tangent.elastic, state).inverse(forces).T for state in own[:_TANGENTS]]
+        changes = [np.zeros((0, flat.shape[1]))]
+        for state in own[:_TANGENTS]:
+            if not bool((tangent.elastic.jacobians(torch.from_numpy(state[None].copy())) > 0.0).all()):
+                continue  # of another simulator: no state of this body
+            try:
+                fields = FactoredTangent(tangent.elastic, state).inverse(forces).T
+            except RuntimeError:  # exactly singular: at a bifurcation
+                continue
+            changes.append(fields / _root_sizes(fields))
         return flat / _root_sizes(flat), np.concatenate(changes)
 
     def _network(
@@ -220,18 +238,24 @@ class Galerkin:
             for name in elastic.material.parameters
         }
         cells = torch.arange(len(elastic.volumes)).repeat_interleave(points)
-        whole = GalerkinNetwork(law, parameters, slopes, weights, support_of(elastic, basis), cells)
-        parts = [whole.shares(torch.from_numpy(state @ basis)) for state in states[0]]
-        for each, fields in zip(variations, states[1:], strict=True):
-            changed = whole.with_parameters(each.parameters)
-            for state in fields:
-                share = changed.shares(torch.from_numpy(state @ basis))
-                parts.append(share)
-                if each.cells is not None:  # a structure's own part is kept, too, however small it is beside the body's
-                    inside = share * np.isin(cells.numpy(), each.cells)
-                    parts.append(inside * (_INSIDE / max(float(np.linalg.norm(inside.sum(axis=1))), 1e-300)))
+        whole = GalerkinNetwork(
+            law, parameters, slopes, weights, support_of(elastic, basis), cells, len(elastic.volumes)
+        )
+
+        def parts() -> Iterator[Floats]:
+            for state in states[0]:
+                yield whole.shares(torch.from_numpy(state @ basis))
+            for each, fields in zip(variations, states[1:], strict=True):
+                changed = whole.with_parameters(each.parameters)
+                for state in fields:
+                    share = changed.shares(torch.from_numpy(state @ basis))
+                    yield share
+                    if each.cells is not None:  # a structure's own part is kept, too, however small it is
+                        inside = share * np.isin(cells.numpy(), each.cells)
+                        yield inside * (_INSIDE / max(float(np.linalg.norm(inside.sum(axis=1))), 1e-300))
+
         most = self.cells + _CELLS_MORE * len(variations)
-        taken, factors, _ = sparse_weights(_sketched(parts), self.tolerance, most)
+        taken, factors, _ = sparse_weights(_sketched(parts(), basis.shape[1]), self.tolerance, most)
         chosen = torch.from_numpy(taken)
         return GalerkinNetwork(
             law,
@@ -240,6 +264,7 @@ class Galerkin:
             weights[chosen] * torch.from_numpy(factors),
             whole.support,
             cells[chosen],
+            len(elastic.volumes),
         )
 
     @staticmethod
@@ -275,18 +300,22 @@ def typical_loads(data: DataSet, train: Samples) -> Floats:
     plans = stored_plans(data.header, "train")
     if not plans or not plans[0].get("loads"):
         return train.forces[:_LOADS]
-    entries = plans[0]["loads"]
-    plan = LoadPlan(**{**entries, "zones": tuple(entries["zones"]), "radius": tuple(entries["radius"])})
+    drawn = [_load_plan(each["loads"]) for each in plans if each.get("loads")]
     known = data.response.apply(train.forces[:_LOADS])
     top = float(np.linalg.norm(known, axis=2).max(axis=1).max())
     found = []
     for number in range(_LOADS):
         rng = np.random.default_rng([0, number])
+        plan = drawn[number // 2 % len(drawn)]  # of merged sets all in turn
         load = draw_smooth_load(data.body, plan, rng) if number % 2 else draw_load(data.body, data.shapes, plan, rng)
         at_loaded = load[data.response.loaded]
         peak = float(np.linalg.norm(data.response.apply(at_loaded[None])[0], axis=1).max())
         found.append(at_loaded * (rng.uniform(_LEAST_SHARE, 1.0) * top / max(peak, 1e-300)))
     return np.stack(found)
+
+
+def _load_plan(entries: Mapping[str, Any]) -> LoadPlan:
+    return LoadPlan(**{**entries, "zones": tuple(entries["zones"]), "radius": tuple(entries["radius"])})
 
 
 def _law_of(data: DataSet) -> str:
@@ -303,16 +332,22 @@ def _spread(data: DataSet, forces: Floats) -> Floats:
     return whole.reshape(len(forces), -1)
 
 
-def _sketched(parts: list[Floats]) -> Floats:
-    """Rows of all parts, or fewer signed sums of them that have the same scalar products in the mean."""
-    rng, size = np.random.default_rng(0), len(parts[0])
-    groups = max(1, _SKETCH // size)
-    if len(parts) <= groups:
-        return np.concatenate(parts)
-    found = np.zeros((groups, *parts[0].shape))
+def _sketched(parts: Iterable[Floats], size: int) -> Floats:
+    """Rows of all parts, or fewer signed sums of them that have the same scalar products in the mean.
+
+    Args:
+        parts: (r, c) each.
+        size: r.
+    """
+    rng, groups = np.random.default_rng(0), max(1, _SKETCH // size)
+    sums: list[Floats] = []
     for number, part in enumerate(parts):
-        found[number % groups] += rng.choice([-1.0, 1.0], size=(size, 1)) * part
-    return found.reshape(-1, parts[0].shape[1])
+        signed = rng.choice([-1.0, 1.0], size=(size, 1)) * part
+        if number < groups:
+            sums.append(signed)
+        else:
+            sums[number % groups] += signed
+    return np.concatenate(sums)
 
 
 def _root_sizes(fields: Floats) -> Floats:

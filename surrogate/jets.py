@@ -108,16 +108,17 @@ class JetAlgebra:
     """
 
     def __init__(self, order: int) -> None:
-        self.order = order
+        self.order, self._unit = order, torch.eye(3, dtype=torch.float64)
 
     def variable(self, F: Tensor) -> Jet:
         """Deformation gradients, (p, 3, 3), as what derivatives are taken by."""
+        self._unit = torch.eye(3, dtype=F.dtype, device=F.device)
         first = torch.eye(9, dtype=F.dtype, device=F.device).reshape(1, 3, 3, 9)
         return Jet(F, first, F.new_zeros(()) if self.order == 2 else None)
 
     def Identity(self, size: int) -> Tensor:  # noqa: N802 - UFL's name
         """The unit tensor."""
-        return torch.eye(size, dtype=torch.float64)
+        return self._unit
 
     def transpose(self, A: Jet) -> Jet:
         """A^T."""

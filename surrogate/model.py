@@ -21,6 +21,7 @@ from softtwin.reference.data.springs import Support, springs_of
 
 from .architecture import Linearisation, Network
 from .encoder_decoder import LinearEncoderDecoder
+from .galerkin import varied
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -36,7 +37,8 @@ class SurrogateState:
         linear: linear part of the displacement, (3n,), metres.
         near: the network at a load nearby, if one is known.
         network: for another tissue than the surrogate's own, where there is one.
-        tissue_ratio: how far out that tissue lies, 1 at the ends of what the surrogate knows.
+        tissue: parameters of that, by name; empty for the surrogate's own.
+        stiffening: how many times as stiff as its own it is: coordinates and linear part are of the load over it.
     """
 
     negative_pivots: int | None = None  # a network has no tangent to count them of
@@ -48,10 +50,12 @@ class SurrogateState:
         linear: Floats,
         near: Linearisation | None = None,
         network: Network | None = None,
-        tissue_ratio: float = 0.0,
+        tissue: Mapping[str, ArrayLike] = MappingProxyType({}),
+        stiffening: float = 1.0,
     ) -> None:
         encoder_decoder = surrogate.encoder_decoder
-        self._surrogate, self.coordinates, self.tissue_ratio = surrogate, coordinates, tissue_ratio
+        self._surrogate, self.coordinates, self.tissue, self._stiffening = surrogate, coordinates, tissue, stiffening
+        self._linear = linear
         self.inner = (network or surrogate.network).linearised(torch.from_numpy(coordinates), near)
         self.displacement: Floats = (
             encoder_decoder.offset + linear + encoder_decoder.decoded(self.inner.values.numpy())
@@ -80,7 +84,19 @@ class SurrogateState:
         if far is None:
             return None
         moved = np.sqrt(np.einsum("ni,ni->n", self.displacement, self.displacement).max())
-        return float(max(far, moved / self._surrogate.card["domain"]["displacement_m"], self.tissue_ratio))
+        return float(max(far, moved / self._surrogate.card["domain"]["displacement_m"], self._tissue_ratio))
+
+    @property
+    def _tissue_ratio(self) -> float:
+        """How far out the tissue lies, 1 at the ends of the ranges that the surrogate was made for."""
+        worst = 0.0
+        for name, (low, high) in self._surrogate.card.get("plan", {}).get("vary", {}).items():
+            parameter, cells = self._surrogate.varied(name)
+            if parameter in self.tissue:
+                values = np.asarray(self.tissue[parameter], dtype=np.float64)
+                here = values if cells is None or values.ndim == 0 else values[cells]
+                worst = max(worst, float(np.abs(here - 0.5 * (low + high)).max()) / (0.5 * (high - low)))
+        return worst
 
     @property
     def is_inside(self) -> bool | None:
@@ -95,7 +111,8 @@ class SurrogateState:
             ValueError: another shape, numbers that are not finite, or changes at nodes that never carry load.
         """
         linear, encoded = self._surrogate.linear_jvp(changes)
-        return linear + self._surrogate.encoder_decoder.decoded(tangent(self.inner, encoded))
+        found = linear + self._surrogate.encoder_decoder.decoded(tangent(self.inner, encoded))
+        return found / self._stiffening
 
     def jvp_inputs(self, changes: Sequence[Change]) -> Floats:
         """Change of the displacement, (3n, k), for k changes of forces and parameters of the tissue.
@@ -115,9 +132,30 @@ class SurrogateState:
                 forces = np.asarray(change.forces, dtype=np.float64).reshape(-1, 1)
                 found[:, place] += self.jvp(forces)[:, 0]
             if change.parameters:
-                values = self.inner.jvp_parameters(change.parameters).numpy()  # type: ignore[attr-defined]
-                found[:, place] += self._surrogate.encoder_decoder.decoded(values)
+                found[:, place] += self._by_tissue(change.parameters)
         return found
+
+    def _by_tissue(self, changes: Mapping[str, ArrayLike]) -> Floats:
+        """Change of the displacement, (3n,), as parameters of the tissue change.
+
+        What all cells share of a change of Young's modulus is one of the load: u(b, E) = u(b / s, E / s).
+        """
+        surrogate = self._surrogate
+        if not surrogate.takes_inputs:
+            raise ValueError(
+                "SurrogateState.jvp_inputs: expected forces, got parameters of the one tissue that is known."
+            )
+        rates, shared = dict(changes), 0.0
+        if "young_modulus" in rates and surrogate.network.stiffening({"young_modulus": 1.0}) != 1.0:
+            modulus = np.asarray(self.tissue.get("young_modulus", surrogate.own_modulus), dtype=np.float64)
+            rate = np.asarray(rates["young_modulus"], dtype=np.float64)
+            modulus, rate = np.broadcast_arrays(modulus, rate)
+            shared = float((rate / modulus).mean())
+            rates["young_modulus"] = (rate - shared * modulus) / self._stiffening
+        values = self.inner.jvp_parameters(rates).numpy()  # type: ignore[attr-defined]
+        encoder_decoder = surrogate.encoder_decoder
+        by_load = self._linear + encoder_decoder.decoded(tangent(self.inner, self.coordinates[:, None])[:, 0])
+        return np.asarray(encoder_decoder.decoded(values) - shared * by_load)
 
     def vjp(self, cotangent: ArrayLike) -> Floats:
         """Gradient with respect to the forces, (n, 3): J^T g, zero at nodes that never carry load.
@@ -136,7 +174,7 @@ class SurrogateState:
         gradient = np.zeros_like(flat)
         inner = self.inner.vjp(torch.from_numpy(encoder_decoder.decoded_adjoint(flat))).numpy()
         gradient[self._surrogate.rows] = encoder_decoder.linear_adjoint(flat) + encoder_decoder.encoded_adjoint(inner)
-        return gradient.reshape(-1, 3)
+        return gradient.reshape(-1, 3) / self._stiffening
 
 
 class Surrogate:
@@ -163,6 +201,7 @@ class Surrogate:
         self.rows = (3 * encoder_decoder.loaded[:, None] + np.arange(3)).ravel()
         self._wanted: tuple[Ints, Floats] = np.zeros(0, dtype=np.int64), encoder_decoder.left[:0]  # rows, left's rows
         self._pushed: tuple[Floats, Floats, Floats] | None = None  # changes, linear parts, coordinates
+        self._cells: dict[str, tuple[str, Ints | None]] = {}  # of what may vary
         self._idle = np.setdiff1d(np.arange(len(body.points)), np.union1d(encoder_decoder.loaded, body.fixed))
 
     @cached_property
@@ -222,7 +261,8 @@ class Surrogate:
                 loaded. Forces at fixed nodes move nothing and are let pass. Inputs that it has learned one value of.
         """
         load = checked_array("Surrogate.forces", forces, self.body.points.shape)
-        network = self.network
+        network, stiffening = self.network, 1.0
+        tissue: dict[str, ArrayLike] = {}
         if inputs is not None:
             if inputs.displacement or any(factor != 1.0 for factor in inputs.springs.values()):
                 raise ValueError(
@@ -230,25 +270,30 @@ class Surrogate:
                     "learned one; the reference knows others (--model reference)."
                 )
             if inputs.forces is not None:
-                load = load + inputs.forces
+                load = load + checked_array("Surrogate.inputs.forces", inputs.forces, load.shape)
             if inputs.parameters:
-                network = network.with_parameters(inputs.parameters)
+                tissue = dict(inputs.parameters)
+                stiffening = network.stiffening(tissue)
+                modulus = (
+                    {"young_modulus": np.asarray(tissue["young_modulus"]) / stiffening} if stiffening != 1.0 else {}
+                )
+                network = network.with_parameters({**tissue, **modulus})
         self._refuse_idle("forces", np.abs(load).max(axis=1))
-        loads = load.ravel()[self.rows]
-        start = near.inner if isinstance(near, SurrogateState) else None
+        loads = load.ravel()[self.rows] / stiffening
+        start = near.inner if isinstance(near, SurrogateState) and near._surrogate is self else None
         encoded, linear = self.encoder_decoder.encoded(loads), self.encoder_decoder.linear(loads)
-        return SurrogateState(self, encoded, linear, start, network, self._tissue_ratio(inputs))
+        return SurrogateState(self, encoded, linear, start, network, tissue, stiffening)
 
-    def _tissue_ratio(self, inputs: Inputs | None) -> float:
-        """How far out a tissue lies, 1 at the ends of the ranges that the surrogate was made for."""
-        worst = 0.0
-        for name, (low, high) in self.card.get("plan", {}).get("vary", {}).items():
-            parameter = name.partition("@")[0].replace("-", "_")
-            if inputs is None or parameter not in inputs.parameters:
-                continue
-            values = np.asarray(inputs.parameters[parameter], dtype=np.float64)
-            worst = max(worst, float(np.abs(values - 0.5 * (low + high)).max()) / (0.5 * (high - low)))
-        return worst
+    def varied(self, name: str) -> tuple[str, Ints | None]:
+        """The parameter that a name of `vary` stands for, and the cells where it is meant; looked up once."""
+        if name not in self._cells:
+            self._cells[name] = varied(name, self.body)
+        return self._cells[name]
+
+    @property
+    def own_modulus(self) -> float:
+        """Young's modulus of the tissue that it has learned, pascals; 1 where the card is silent."""
+        return float((self.learned_material or {}).get("young_modulus", 1.0))
 
     def propose(self, forces: ArrayLike, linear: Floats | None = None) -> Floats:
         """The displacement alone, (n, 3), metres, in single precision and half of the time: for Newton to start from.

@@ -26,11 +26,11 @@ from .jets import Jet, JetAlgebra
 Floats = NDArray[np.float64]
 _PARAMETER = "parameter_"
 _TOLERANCE, _ROUGH = 1e-10, 1e-6  # out-of-balance forces relative to the load's, exact and rounded
-_ITERATIONS = 60
+_ITERATIONS, _ESCAPES = 200, 3  # of Newton's method; from balanced states that are not stable
 _DESCENT = 1e-4  # of what the slope promises
 _SHORTEST = 1e-6
 _FAST = 0.1  # by which out-of-balance forces are to fall in a step, or the tangent is made anew
-_SHIFTS = tuple(0.01 * 4.0**i for i in range(12))  # of the stiffness at rest, added to a tangent that is indefinite
+_SHIFTS = tuple(1e-3 * 4.0**i for i in range(14))  # of the stiffness at rest, added to a tangent that is indefinite
 _LEAST_JACOBIAN = 0.1  # in any cell of a state that cells are chosen by
 _EPSILONS = 8.0  # of machine precision, by which sums that cancel are off
 
@@ -45,6 +45,10 @@ class GalerkinNetwork(Network):
         weights: volume that each of them stands for, (p,), m^3.
         support: stiffness of what holds the body and gives way, between modes, (r, r), N/m.
         cells: number of the body's cell that each of them lies in, (p,).
+        cell_count: of the body.
+
+    Raises:
+        ValueError: cells that leave a direction of the modes without stiffness.
     """
 
     is_graph = False
@@ -53,6 +57,7 @@ class GalerkinNetwork(Network):
     support: Tensor
     law: Tensor
     cells: Tensor
+    cell_count: Tensor
     at_rest: Tensor
 
     def __init__(
@@ -63,22 +68,44 @@ class GalerkinNetwork(Network):
         weights: Tensor,
         support: Tensor,
         cells: Tensor,
+        cell_count: int,
     ) -> None:
         super().__init__()
         self.register_buffer("slopes", slopes.contiguous())
         self.register_buffer("weights", weights)
         self.register_buffer("support", support)
         self.register_buffer("cells", cells)
+        self.register_buffer("cell_count", torch.tensor(cell_count))
         self.register_buffer("law", torch.tensor(list(law.encode()), dtype=torch.uint8))
         for name, values in parameters.items():
             self.register_buffer(f"{_PARAMETER}{name}", values)
         self.is_exact = True
         self.register_buffer("at_rest", self.stiffness(torch.zeros_like(slopes[0, 0])))
+        if int(torch.linalg.cholesky_ex(self.at_rest)[1]):
+            raise ValueError(
+                f"GalerkinNetwork: expected cells that hold all of {slopes.shape[2]} modes, got {len(slopes)} points, "
+                "which leave some without stiffness; take more cells, or a smaller tolerance."
+            )
 
     @property
     def parameters_of_law(self) -> dict[str, Tensor]:
         """By name, (p,) or (1,)."""
         return {n.removeprefix(_PARAMETER): values for n, values in self.named_buffers() if n.startswith(_PARAMETER)}
+
+    def stiffening(self, values: Mapping[str, ArrayLike]) -> float:
+        """How many times as stiff as its own a tissue is, in the geometric mean over cells: what scales loads alone.
+
+        1 where springs hold the body, which do not grow with it.
+
+        Args:
+            values: as for `with_parameters`.
+        """
+        if "young_modulus" not in values or bool(self.support.any()):
+            return 1.0
+        given, own = np.asarray(values["young_modulus"], dtype=np.float64), self.parameters_of_law["young_modulus"]
+        if not (given > 0.0).all() or bool((own != own[0]).any()):
+            return 1.0  # no tissue, which `with_parameters` says; or one of several parts
+        return float(np.exp(np.log(given).mean() - np.log(own.cpu().numpy()).mean()))
 
     def rounded(self) -> GalerkinNetwork:
         """The same, good to six digits and faster: forces in double precision, tangents in single."""
@@ -93,11 +120,13 @@ class GalerkinNetwork(Network):
             values: a number, or one for each cell of the body, by the parameters' names; others stay.
 
         Raises:
-            ValueError: a parameter that the law does not have.
+            ValueError: a parameter that the law does not have, values that it cannot have, or not one for each cell.
         """
         found = {f"{_PARAMETER}{name}": self._in_points(name, value) for name, value in values.items()}
+        type(self._law)(**{**self._law.parameters, **values})  # refuses what no tissue has
         other = copy.copy(self)
         other._buffers = {**self._buffers, **found}
+        other.__dict__.pop("noise", None)
         return other
 
     def _in_points(self, name: str, value: ArrayLike) -> Tensor:
@@ -107,6 +136,11 @@ class GalerkinNetwork(Network):
                 f"GalerkinNetwork.{name}: expected parameters among {sorted(self.parameters_of_law)}, got another one."
             )
         given = np.asarray(value, dtype=np.float64)
+        if given.shape not in ((), (int(self.cell_count),)):
+            raise ValueError(
+                f"GalerkinNetwork.{name}: expected a number or one for each of the {int(self.cell_count)} cells, got "
+                f"shape {given.shape}."
+            )
         return torch.from_numpy(given.reshape(1) if given.ndim == 0 else given[self.cells.numpy()]).to(self.slopes)
 
     def forces_by_parameters(self, q: Tensor, changes: Mapping[str, ArrayLike]) -> Tensor:
@@ -157,7 +191,8 @@ class GalerkinNetwork(Network):
         """The network from what its `state_dict` was."""
         law = bytes(tensors["law"].tolist()).decode()
         parameters = {n.removeprefix(_PARAMETER): v for n, v in tensors.items() if n.startswith(_PARAMETER)}
-        return GalerkinNetwork(law, parameters, *(tensors[n] for n in ("slopes", "weights", "support", "cells")))
+        slopes, weights, support, cells = (tensors[name] for name in ("slopes", "weights", "support", "cells"))
+        return GalerkinNetwork(law, parameters, slopes, weights, support, cells, int(tensors["cell_count"]))
 
     def shares(self, q: Tensor) -> Floats:
         """Of each cell in the forces along the modes, (r, p), in the energy norm at rest, as shares of a force of one.
@@ -255,7 +290,8 @@ class _Search:
         return stored - float(self.load @ q), self.load - forces
 
     def found(self, near: GalerkinState | None) -> tuple[Tensor, Tensor]:
-        """Coordinates of the state, and the last factor of a tangent."""
+        """Coordinates of the state, and the factor of its tangent, which is positive definite."""
+        escapes = 0
         q, factor, is_fresh = torch.zeros_like(self.load), self.network.rest_factor, True
         energy, missing = self._look(q)
         if near is not None:
@@ -266,7 +302,15 @@ class _Search:
         for _ in range(_ITERATIONS):
             left = float(torch.linalg.vector_norm(missing))
             if left <= self.enough:
-                return q, factor
+                factor, is_stable = self._factor(q)
+                if is_stable:
+                    return q, factor
+                q, (energy, missing) = self._off_the_saddle(q, energy)
+                escapes, is_fresh = escapes + 1, True
+                factor, _ = self._factor(q)
+                if escapes > _ESCAPES:
+                    break
+                continue
             step = torch.cholesky_solve(missing[:, None], factor)[:, 0]
             length, there = self._length(q, step, energy, missing)
             if length:
@@ -276,11 +320,23 @@ class _Search:
             is_slow = length < 1.0 or float(torch.linalg.vector_norm(missing)) > _FAST * left
             is_fresh = is_slow
             if is_slow:
-                factor = self._factor(q)
+                factor, _ = self._factor(q)
         raise NotConverged(
-            f"GalerkinNetwork: no equilibrium was found; out-of-balance forces are {left / self.size:.1e} of the "
-            "load's. The load may be too large: try a smaller one."
+            f"GalerkinNetwork: no stable equilibrium was found; out-of-balance forces are {left / self.size:.1e} of "
+            "the load's. The load may be too large: try a smaller one."
         )
+
+    def _off_the_saddle(self, q: Tensor, energy: float) -> tuple[Tensor, tuple[float, Tensor]]:
+        """A state of less energy in the direction in which a balanced one gives way most."""
+        way = torch.linalg.eigh(self.network.stiffness(q)).eigenvectors[:, 0]
+        length = float(torch.linalg.vector_norm(q))
+        while length > self.noise:
+            for sign in (1.0, -1.0):
+                there = self._look(q + sign * length * way)
+                if there[0] < energy - self.noise:
+                    return q + sign * length * way, there
+            length *= 0.5
+        return q, self._look(q)
 
     def _length(self, q: Tensor, step: Tensor, energy: float, missing: Tensor) -> tuple[float, tuple[float, Tensor]]:
         """Length of a step that lowers the energy, or leaves it and brings forces nearer to balance; 0 for none."""
@@ -295,14 +351,16 @@ class _Search:
             length *= 0.5
         return 0.0, (energy, missing)
 
-    def _factor(self, q: Tensor) -> Tensor:
+    def _factor(self, q: Tensor) -> tuple[Tensor, bool]:
+        """Of the tangent, or of a positive definite one beside it, and whether it is the tangent's own."""
         tangent = self.network.stiffness(q, self.network.is_exact)
         factor, info = torch.linalg.cholesky_ex(tangent)
+        is_own = not int(info)
         for shift in _SHIFTS:
             if not int(info):
                 break
             factor, info = torch.linalg.cholesky_ex(tangent + shift * self.network.at_rest)
-        return factor
+        return factor, is_own
 
 
 class GalerkinState:
@@ -312,27 +370,17 @@ class GalerkinState:
         network: that found it.
         load: coordinates of the load, (r,).
         q: coordinates of the displacement, (r,).
-        factor: of a tangent nearby, (r, r).
+        factor: of its tangent, (r, r).
     """
 
     def __init__(self, network: GalerkinNetwork, load: Tensor, q: Tensor, factor: Tensor) -> None:
         self.network, self.load, self.q, self.factor = network, load, q, factor
         self.values = q - torch.cholesky_solve(load[:, None], network.rest_factor)[:, 0]
 
-    @cached_property
-    def _tangent(self) -> Tensor:
-        """Factor of the tangent here; the last one of the search where six digits are enough and it is as near."""
-        tangent = self.network.stiffness(self.q, self.network.is_exact)
-        factor, info = torch.linalg.cholesky_ex(tangent)
-        if int(info):
-            return self.factor
-        self.factor = factor
-        return factor
-
     def jvp(self, tangents: Tensor) -> Tensor:
         """Changes of the values, (r, k), for changes of the coordinates, (r, k)."""
         changes = tangents.to(self.q)
-        return torch.cholesky_solve(changes, self._tangent) - torch.cholesky_solve(changes, self.network.rest_factor)
+        return torch.cholesky_solve(changes, self.factor) - torch.cholesky_solve(changes, self.network.rest_factor)
 
     def vjp(self, cotangent: Tensor) -> Tensor:
         """Gradient with respect to the coordinates, (r,), for one with respect to the values, (r,): symmetric."""
@@ -341,4 +389,4 @@ class GalerkinState:
     def jvp_parameters(self, changes: Mapping[str, ArrayLike]) -> Tensor:
         """Change of the values, (r,), as parameters of the law change: see `GalerkinNetwork.forces_by_parameters`."""
         forces = self.network.forces_by_parameters(self.q, changes)
-        return -torch.cholesky_solve(forces[:, None], self._tangent)[:, 0]
+        return -torch.cholesky_solve(forces[:, None], self.factor)[:, 0]
