@@ -226,7 +226,13 @@ class SamplesSection(Section):
 
     group: ClassVar[str] = "equilibria"
 
-    train: int = option(512, "equilibria to learn from", ge=1, basic=True, flag="--samples")
+    train: int = option(
+        512,
+        "equilibria to learn from; build makes 32 for architecture galerkin where none are asked for",
+        ge=1,
+        basic=True,
+        flag="--samples",
+    )
     validation: int = option(64, "draws to choose the best weights with", ge=1)
     test: int = option(128, "draws held out, never seen in training", ge=1)
     calibration: int = option(
@@ -603,6 +609,14 @@ class Config(Section):
     def supports(self) -> dict[str, Support]:
         """The springs of each part of the surface, and ligaments, by name."""
         return self.springs.supports(self.body.unit, files_axes(self.body) == "ras")
+
+    @model_validator(mode="after")
+    def _galerkin_chooses_nothing(self) -> Config:
+        if self.samples.rounds and self.training.architecture == "galerkin":
+            raise ValueError(
+                "samples.rounds: expected 0 with architecture galerkin, which learns nothing more from them"
+            )
+        return self
 
     @model_validator(mode="after")
     def _surrogate_knows_the_tissue(self) -> Config:

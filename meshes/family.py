@@ -53,12 +53,13 @@ def member(number: int, seed: int = 0, nodes: int | None = None) -> Member:
     """The organ of a number, on any machine the same up to rounding.
 
     A box of tetrahedra is rounded, tapered, bent and displaced by a smooth Gaussian process; a part of its surface is
-    held. No file is read.
+    held. Where its cells bear none of that, it is the box. No file is read.
 
     Args:
         number: 0 or more.
         seed: of the whole family.
-        nodes: about so many; drawn from 300 to 2,500 if not given.
+        nodes: so many cells' corners in a box of its extents: up to twice as many nodes come where they are few; drawn
+            from 300 to 2,500 if not given.
 
     Raises:
         ValueError: a negative number, or fewer than 100 nodes.

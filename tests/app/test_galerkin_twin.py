@@ -86,6 +86,13 @@ def test_a_parameter_without_a_range_is_refused(folder: Path) -> None:
         Twin.open(folder, "surrogate", parameters=("young-modulus@vessel_portal",))
     with pytest.raises(ConfigError, match=r"expected architecture galerkin beside it, got reduced"):
         parse_config({"training": {"vary": {"poisson-ratio": [0.4, 0.45]}}, "body": {"source": "liver-phantom"}}, "x")
+    with pytest.raises(ConfigError, match=r"samples\.rounds: expected 0 with architecture galerkin"):
+        given = {
+            "training": {"architecture": "galerkin"},
+            "samples": {"rounds": 2},
+            "body": {"source": "liver-phantom"},
+        }
+        parse_config(given, "x")
     with pytest.raises(ConfigError, match="two growing positive numbers for poisson-ratio"):
         from softtwin.app.stages.plan import training_plan
 
