@@ -24,10 +24,12 @@ class Prepared:
     Args:
         forces: the unknown forces.
         model: from their coefficients to the observed nodes.
+        whole: the forward model that this is the reduced one of.
     """
 
     forces: NodalForces
     model: ReducedModel
+    whole: ForwardModel
 
     @classmethod
     def of(
@@ -38,16 +40,16 @@ class Prepared:
         inputs: InputBlocks | None = None,
     ) -> Prepared:
         """What can be multiplied before a cloud comes."""
-        return cls(forces, reduce_model(model, observed.nodes, forces.basis, inputs))
+        return cls(forces, reduce_model(model, observed.nodes, forces.basis, inputs), model)
 
     def informed(self, observed: SurfaceDistance, rule: LikelihoodInformed) -> Prepared:
         """The directions that a cloud can tell: see `likelihood_informed`."""
         kept = likelihood_informed(self.model, observed, rule, self.forces.scale.median)
-        return Prepared(self.forces.combined(kept), self.model.combined(kept))
+        return Prepared(self.forces.combined(kept), self.model.combined(kept), self.whole)
 
     def leading(self, count: int) -> Prepared:
         """The first directions alone."""
-        return Prepared(self.forces.leading(count), self.model.combined(np.eye(self.forces.size)[:, :count]))
+        return Prepared(self.forces.leading(count), self.model.combined(np.eye(self.forces.size)[:, :count]), self.whole)
 
     @cached_property
     def unseen(self) -> Floats:

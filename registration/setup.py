@@ -119,6 +119,10 @@ class Setup:
         """Other forces, with the model that they are reduced with."""
         return Prepared.of(self.model, self.observed, forces, self.inputs)
 
+    def followed(self, last: Prepared) -> Prepared:
+        """The forces of a frame before, with this model where another one was reduced with them."""
+        return last if last.whole is self.model else self.prepared(last.forces)
+
     def reduced(self, fast: ForwardModel, forces: NodalForces) -> ReducedModel:
         """A faster model between forces and the observed nodes; that of the last forces is kept."""
         if not self._fast or self._fast[0][0] is not fast or self._fast[0][1] is not forces:

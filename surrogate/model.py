@@ -503,4 +503,5 @@ class ReducedSurrogate:
             raise ValueError(f"coefficients: expected shape ({self.encode.shape[1]},), got {c.shape}.")
         if isinstance(near, ReducedSurrogateState) and near.model is self and np.array_equal(near.coefficients, c):
             return near
-        return ReducedSurrogateState(self, c, near.inner if isinstance(near, ReducedSurrogateState) else None)
+        is_own = isinstance(near, ReducedSurrogateState) and near.model.surrogate is self.surrogate
+        return ReducedSurrogateState(self, c, near.inner if is_own else None)

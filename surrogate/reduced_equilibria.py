@@ -183,7 +183,7 @@ class GalerkinNetwork(Network):
             NotConverged: no equilibrium was found.
         """
         load = coordinates.to(self.slopes)
-        start = near if isinstance(near, GalerkinState) and near.q.shape == load.shape else None
+        start = near if isinstance(near, GalerkinState) and near.network.slopes is self.slopes else None
         return GalerkinState(self, load, *_Search(self, load).found(start))
 
     @staticmethod

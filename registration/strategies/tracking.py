@@ -21,13 +21,14 @@ def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
         points: of the cloud.
         last: the frame before.
     """
-    problem = setup.problem(points, last.prepared, last.evaluation.positions, last.rms_distance)
+    prepared = setup.followed(last.prepared)
+    problem = setup.problem(points, prepared, last.evaluation.positions, last.rms_distance)
     near = problem.begun(problem.carried(last.evaluation.coefficients, last.problem), last.evaluation)
     if _is_nearer_at_rest(setup, near, last):  # the tool has let go: no way back through all states between
-        begun = from_rest(setup, points, last.prepared, setup.options.solver)
-        return finish(setup, points, Localised(last.prepared, begun))
+        begun = from_rest(setup, points, prepared, setup.options.solver)
+        return finish(setup, points, Localised(prepared, begun))
     solver = setup.options.solver.following()
-    return Ended(last.prepared, solver.solve(problem, near.coefficients, near, last.eta))
+    return Ended(prepared, solver.solve(problem, near.coefficients, near, last.eta))
 
 
 def has_left(setup: Setup, found: Registration, last: Registration) -> bool:
