@@ -97,8 +97,9 @@ def test_an_organ_of_any_stiffness_keeps_the_same_directions(body: Body, stiffer
     def directions(stiffness: float) -> int:
         every = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.003 * stiffness, 1.0))
         softer = replace(every, patterns=every.patterns / stiffness)  # as far moved by forces that are so much larger
-        model = reduce_model(Cantilever(body), observed.nodes, softer.basis)
-        return Prepared(every, model).informed(observed, LikelihoodInformed()).forces.size
+        whole = Cantilever(body)
+        model = reduce_model(whole, observed.nodes, softer.basis)
+        return Prepared(every, model, whole).informed(observed, LikelihoodInformed()).forces.size
 
     assert directions(stiffer) == directions(1.0) == 3
 
