@@ -49,7 +49,8 @@ class Prepared:
 
     def leading(self, count: int) -> Prepared:
         """The first directions alone."""
-        return Prepared(self.forces.leading(count), self.model.combined(np.eye(self.forces.size)[:, :count]), self.whole)
+        some = np.eye(self.forces.size)[:, :count]
+        return Prepared(self.forces.leading(count), self.model.combined(some), self.whole)
 
     @cached_property
     def unseen(self) -> Floats:

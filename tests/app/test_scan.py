@@ -58,7 +58,7 @@ def built(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> Config:
 def test_build_makes_an_organ_of_labels_held_where_another_touches(
     files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["--organ", "liver", "--inner", "tumour", "--fixed", "touching:inferior_vena_cava:4mm", "--nodes", 200]
+    words = ["--organ", "liver", "--inner", "tumour", "--fixed", "touching:inferior_vena_cava:6mm", "--nodes", 400]
     config = built(monkeypatch, files / "total.nii.gz", *words)
     assert coordinates_of(config).unit == "mm" and coordinates_of(config).axes == "ras"
     organ = make_organ(config.body, Path("/"))
@@ -66,7 +66,7 @@ def test_build_makes_an_organ_of_labels_held_where_another_touches(
     assert organ.body.volume == pytest.approx(volume, rel=0.05)
     assert np.abs(ORGAN(1e3 * organ.body.points[organ.body.boundary_nodes])).max() < 4.0
     held = 1e3 * organ.body.points[organ.body.fixed]
-    assert len(held) >= 3 and CAVA(held).max() < 4.0 + 1.8  # a voxel's half diagonal more
+    assert len(held) >= 3 and CAVA(held).max() < 6.0 + 1.8  # a voxel's half diagonal more
     assert np.abs(TUMOUR(1e3 * organ.body.inner["tumour"].points)).mean() < 0.4
     assert any("tumour lies inside liver" in note for note in organ.notes)
 
