@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
+import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples
 
 from .encoder_decoder import LinearEncoderDecoder
+from .residual import ElasticBody
 
+Floats = NDArray[np.float64]
 _AT_ONCE = 64  # tangents: a thousand through the grids of a U-Net would take 20 GB
 
 
@@ -171,6 +175,45 @@ class TrainedArchitecture(Architecture, Protocol):
 
     def optimizer(self, network: Any, rate: float) -> torch.optim.Optimizer:
         """What trains the lesson's network; its rate is set before every step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lesson:
+    """What a network that is in use is to learn, beside what it knows.
+
+    Args:
+        elastic: the body with the material that the network has learned.
+        loads: forces at the loaded nodes, (s, 3l), newtons.
+        displacements: the equilibria under them, (s, 3n), metres.
+        pushes: small changes of each load, (k, 3l), newtons.
+        changes: of the displacement by each of these, (k, 3n), metres, to first order.
+        known_loads: as those that it was made with, (r, 3l), newtons.
+        known_displacements: what it makes of them, (r, 3n), metres.
+        seconds: that it may train for.
+    """
+
+    elastic: ElasticBody
+    loads: Floats
+    displacements: Floats
+    pushes: Sequence[Floats]
+    changes: Sequence[Floats]
+    known_loads: Floats
+    known_displacements: Floats
+    seconds: float
+
+
+@runtime_checkable
+class AdaptableArchitecture(Architecture, Protocol):
+    """One that learns from equilibria of its own use."""
+
+    rehearsed: ClassVar[int]
+    """States of the surrogate as it was built that it learns from again, so that it does not forget."""
+
+    @staticmethod
+    def adapted(
+        encoder_decoder: LinearEncoderDecoder, network: Any, lesson: Lesson
+    ) -> tuple[LinearEncoderDecoder, Network]:
+        """The maps and the network after a lesson; coordinates of the loads that are new come last."""
 
 
 @runtime_checkable

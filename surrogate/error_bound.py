@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -62,6 +63,50 @@ class ErrorEstimator:
             )
         self._known: dict[str, Any] = dict(known)
         self.reader = IndicatorReader(surrogate)
+
+    @property
+    def certificate(self) -> dict[str, Any]:
+        """What it knows, as a card holds it."""
+        return dict(self._known)
+
+    def of(self, surrogate: Surrogate) -> ErrorEstimator:
+        """The same powers and quantiles for a surrogate that was adapted; those of Newton's steps are not known."""
+        other = copy.copy(self)
+        other.reader = self.reader.of(surrogate)
+        other._known = {name: entry for name, entry in self._known.items() if name != "newton"}
+        return other
+
+    def scaled(self, factors: Mapping[Error, float]) -> ErrorEstimator:
+        """The same with bounds that are so many times as wide.
+
+        Args:
+            factors: of each kind of error.
+        """
+        other = copy.copy(self)
+        wide = {
+            error: [None if value is None else factors[error] * value for value in values]
+            for error, values in self._known["quantiles"].items()
+        }
+        other._known = {**self._known, "quantiles": wide}
+        return other
+
+    def within(self, seen: Sequence[ErrorIndicators]) -> ErrorEstimator:
+        """The same, which may be relied upon for loads like those of other predictions, too.
+
+        Args:
+            seen: what these have shown.
+        """
+        limits = dict(self._known["limits"])
+        for name in ("size", "residual", "step"):
+            shown = [getattr(each, name) for each in seen]
+            limits[name] = max([limits[name], *(value for value in shown if np.isfinite(value))])
+        load = limits.get("load")
+        ratios = [ratio for each in seen if (ratio := typical_ratio(each, load)) is not None]
+        if load is not None and max(ratios, default=0.0) > 1.0:
+            limits["load"] = {**load, "limit": load["limit"] + float(np.log(max(ratios)))}
+        other = copy.copy(self)
+        other._known = {**self._known, "limits": limits}
+        return other
 
     def bound_error(self, forces: ArrayLike, state: SurrogateState | None = None, newton: bool = False) -> ErrorBound:
         """How wrong the prediction for nodal forces may be.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -96,6 +97,22 @@ class ErrorIndicators:
         return found
 
 
+def elastic_of(surrogate: Surrogate) -> ElasticBody:
+    """The body of a surrogate with the material and the springs that it has learned.
+
+    Raises:
+        CalibrationError: its card does not name a material, or one that torch does not know.
+    """
+    learned = surrogate.learned_material
+    if learned is None or learned["material"] not in MATERIALS:
+        raise CalibrationError(
+            "elastic_of.surrogate: expected a card that names the material of its equilibria, got "
+            f"{None if learned is None else learned['material']}; without it nothing is known of balance."
+        )
+    material = MATERIALS[learned["material"]](learned["young_modulus"], learned["poisson_ratio"])
+    return ElasticBody(surrogate.body, material, springs=surrogate.learned_springs)
+
+
 class IndicatorReader:
     """What is out of balance in predictions for one body, and where a linear step would lead.
 
@@ -109,18 +126,17 @@ class IndicatorReader:
     """
 
     def __init__(self, surrogate: Surrogate) -> None:
-        learned = surrogate.learned_material
-        if learned is None or learned["material"] not in MATERIALS:
-            raise CalibrationError(
-                "IndicatorReader.surrogate: expected a card that names the material of its equilibria, got "
-                f"{None if learned is None else learned['material']}; without it nothing is known of balance."
-            )
-        material = MATERIALS[learned["material"]](learned["young_modulus"], learned["poisson_ratio"])
         self.surrogate = surrogate
-        self._elastic = ElasticBody(surrogate.body, material, springs=surrogate.learned_springs)
+        self._elastic = elastic_of(surrogate)
         free = np.ones(surrogate.body.points.shape, dtype=bool)
         free[surrogate.body.fixed] = False
         self._free = free.ravel()
+
+    def of(self, surrogate: Surrogate) -> IndicatorReader:
+        """The same of another surrogate of the same body and material: nothing is factored again."""
+        other = copy.copy(self)
+        other.surrogate = surrogate
+        return other
 
     @cached_property
     def _factor(self) -> Any:

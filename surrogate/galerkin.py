@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from softtwin.reference.data.materials import MATERIALS, Material, with_paramete
 from softtwin.reference.data.samplers import LoadPlan, draw_load, draw_smooth_load
 from softtwin.reference.data.springs import ligaments_of
 
+from .architecture import Lesson
 from .cubature import sparse_weights
 from .encoder_decoder import LinearEncoderDecoder, response_parts
 from .modal_derivatives import FactoredTangent, leading_modes, modal_derivatives, without
@@ -36,6 +37,8 @@ _LEAST_SHARE = 0.2  # of the usual top, that the smallest of them are
 _STATES = 48  # of typical loads, that the cells are chosen by
 _SKETCH = 5000  # combinations of what the cells are chosen by (count sketch: Charikar, Chen, Farach-Colton 2004)
 _OWN, _TANGENTS = 32, 24  # equilibria, at most, that the basis is told of, and whose tangents
+# Adapting while it is used: modes that are pushed, at so many states; modes and cells then.
+_PUSHED, _PUSHED_AT, _NEW_MODES, _NEW_CELLS, _NEW_TOLERANCE = 16, 4, 24, 450, 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +83,7 @@ class Galerkin:
     vary: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     name: ClassVar[str] = "galerkin"
+    rehearsed: ClassVar[int] = 16
 
     def __post_init__(self) -> None:
         for name in ("modes", "curved", "cells"):
@@ -266,6 +270,37 @@ class Galerkin:
             cells[chosen],
             len(elastic.volumes),
         )
+
+    @staticmethod
+    def adapted(
+        encoder_decoder: LinearEncoderDecoder, network: GalerkinNetwork, lesson: Lesson
+    ) -> tuple[LinearEncoderDecoder, GalerkinNetwork]:
+        """With modes of equilibria that are new, and of how they change, and cells chosen anew by them.
+
+        Args:
+            encoder_decoder: the maps around the network.
+            network: as it was made.
+            lesson: the equilibria.
+        """
+        elastic, old = lesson.elastic, encoder_decoder.decode
+        assert old is not None
+        law = bytes(network.law.tolist()).decode()
+        own, pushed = lesson.displacements, [lesson.displacements / _root_sizes(lesson.displacements)]
+        changes = np.concatenate(lesson.changes)
+        pushed.append(changes / _root_sizes(changes))
+        forces = elastic.stiffness(torch.zeros(elastic.nodes, 3, dtype=torch.float64)) @ old[:, :_PUSHED]
+        for place in np.unique(np.linspace(0, len(own) - 1, _PUSHED_AT).astype(int)):
+            fields = FactoredTangent(elastic, own[place].reshape(-1, 3)).inverse(forces).T
+            pushed.append(fields / _root_sizes(fields))
+        outside = [without(fields, old) for fields in pushed]
+        scaled = [fields / max(float(np.linalg.norm(fields)), 1e-300) for fields in outside]
+        more = without(leading_modes(np.concatenate(scaled), _NEW_MODES).T, old).T
+        basis = np.hstack([old, np.linalg.qr(more)[0]])
+        basis.reshape(-1, 3, basis.shape[1])[~elastic.free[:, 0].numpy().astype(bool)] = 0.0
+        settings = Galerkin(cells=_NEW_CELLS, tolerance=_NEW_TOLERANCE)
+        found = settings._network(law, elastic, basis, [np.concatenate([own, lesson.known_displacements])], [])
+        at_loaded = basis.reshape(-1, 3, basis.shape[1])[encoder_decoder.loaded].reshape(-1, basis.shape[1])
+        return replace(encoder_decoder, encode=np.ascontiguousarray(at_loaded.T), decode=basis), found
 
     @staticmethod
     def from_state_dict(tensors: Mapping[str, Tensor]) -> GalerkinNetwork:

@@ -7,6 +7,7 @@ response: it learns from gradients, too.
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +22,7 @@ from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, LinearResponse, Samples, probe_cotangents
 from softtwin.reference.data.jacobians import Jacobians, read_jacobians
 
-from .architecture import Linearisation, Network
+from .architecture import Lesson, Linearisation, Network
 from .encoder_decoder import LinearEncoderDecoder, response_parts
 from .optimizers import MuonWithAdamW
 from .pod import ReducedBasis, basis_of, learned_basis, semi_relative, sizes_of
@@ -34,6 +35,8 @@ _TINY = 1e-30  # a number in single precision, too
 _DIRECTIONS = 8192  # that Jacobians are looked at in
 _LEAST_SPREAD = 0.3  # of the largest: coordinates that training loads hardly have, and others may, are not whitened
 _WEIGHT_DECAY = 0.2  # less of it is more exact on loads like those of the training, and worse on others
+_RATE, _AT_A_TIME = 1e-3, 128  # while it is used: learning rate, falling to zero; samples a step, new and known ones
+_LEAST_WEIGHED = 0.01  # of the mean square, as `pod.semi_relative` has it
 _SHARE = 4  # one sample in so many enters the gradient's loss: it costs three times the other and needs fewer
 
 
@@ -62,6 +65,7 @@ class Reduced:
     symmetries: bool = True
 
     name: ClassVar[str] = "reduced"
+    rehearsed: ClassVar[int] = 192
     rate: ClassVar[float] = 3e-3
     batch: ClassVar[int] = 256
 
@@ -85,6 +89,41 @@ class Reduced:
         inside = {id(weight) for weight in hidden}
         others = [weight for weight in network.parameters() if id(weight) not in inside]
         return MuonWithAdamW(hidden, others, rate, _WEIGHT_DECAY)
+
+    @staticmethod
+    def adapted(
+        encoder_decoder: LinearEncoderDecoder, network: AveragedNetwork, lesson: Lesson
+    ) -> tuple[LinearEncoderDecoder, AveragedNetwork]:
+        """Trained on from its weights, on equilibria with their first-order changes, and on what it was built to know.
+
+        Args:
+            encoder_decoder: the maps around the network.
+            network: as it was made.
+            lesson: the equilibria.
+        """
+        loads, targets, weights = _lesson(encoder_decoder, network, lesson)
+        inner = ReducedNetwork(
+            network.input_scale.float(), float(network.output_scale), network.enter.out_features, len(network.inner)
+        )
+        inner.load_state_dict({name: network.state_dict()[name].float() for name in inner.state_dict()})
+        new, chance = len(loads) - len(network.turns) * len(lesson.known_loads), torch.Generator().manual_seed(0)
+        optimizer, begin, used = torch.optim.Adam(inner.parameters(), lr=_RATE), time.monotonic(), 0.0
+        while used < 1.0:
+            for group in optimizer.param_groups:
+                group["lr"] = _RATE * (1.0 - used)
+            batch = torch.cat(
+                [
+                    torch.randint(new, (_AT_A_TIME,), generator=chance),
+                    torch.randint(new, len(loads), (_AT_A_TIME if new < len(loads) else 0,), generator=chance),
+                ]
+            )
+            optimizer.zero_grad()
+            missed = (inner(loads[batch]) - targets[batch]).square().sum(dim=1)
+            (missed * weights[batch]).mean().backward()
+            optimizer.step()
+            used = (time.monotonic() - begin) / max(lesson.seconds, 1e-9)
+        trained = AveragedNetwork(inner.double(), network.turns).requires_grad_(False)
+        return encoder_decoder, trained
 
     @staticmethod
     def from_state_dict(tensors: Mapping[str, Tensor]) -> AveragedNetwork:
@@ -434,6 +473,33 @@ class ReducedObjective(nn.Module):
 
 def _corrections(response: LinearResponse, samples: Samples) -> Floats:
     return samples.displacements - response.apply(samples.forces)
+
+
+def _lesson(
+    encoder_decoder: LinearEncoderDecoder, network: AveragedNetwork, lesson: Lesson
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Coordinates, (s, r), corrections, (s, r), and weights, (s,), of all symmetric images: new ones first."""
+    assert encoder_decoder.decode is not None
+    loads, displacements = [lesson.loads], [lesson.displacements]
+    for load, state, pushes, changes in zip(
+        lesson.loads, lesson.displacements, lesson.pushes, lesson.changes, strict=True
+    ):
+        loads += [load + pushes, load - pushes]
+        displacements += [state + changes, state - changes]
+    pairs = (np.concatenate(loads), np.concatenate(displacements)), (lesson.known_loads, lesson.known_displacements)
+    turns, parts = network.turns.numpy(), []
+    squares = np.concatenate([(displacements**2).sum(axis=1) for _, displacements in pairs])
+    mean = squares.mean()
+    for loads, displacements in pairs:
+        coordinates = encoder_decoder.encoded(loads.T).T
+        corrections = (displacements - encoder_decoder.linear(loads.T).T) @ encoder_decoder.decode
+        sizes = np.sqrt((displacements**2).sum(axis=1) * mean)
+        images = [
+            np.einsum("gij,sj->gsi", turns, each).reshape(-1, turns.shape[2]) for each in (coordinates, corrections)
+        ]
+        parts.append((*images, np.tile(1.0 / (sizes + _LEAST_WEIGHED * mean), len(turns))))
+    whole = [_tensor(np.concatenate(each)) for each in zip(*parts, strict=True)]
+    return whole[0], whole[1], whole[2]
 
 
 def _basis_of(stored: Jacobians, data: DataSet, settings: Reduced) -> ReducedBasis:
