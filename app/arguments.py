@@ -46,6 +46,14 @@ class WatchArguments(Section):
         basic=True,
     )
     idle: float | None = option(None, "end after this time without a new cloud", unit="seconds", gt=0.0)
+    learn: bool = option(
+        False,
+        "learn while it is used: a second process solves for exact states of frames and of loads that may come, and "
+        "adapts the surrogate to them; frames wait for nothing",
+    )
+    keep: bool = option(
+        False, "with learn: put what was learned into the twin at the end, and what was built into its folder as-built"
+    )
 
 
 class RegisterArguments(Section):

@@ -307,6 +307,8 @@ def register(
     budget: float | None,
     watch: bool,
     idle: float | None,
+    learn: bool,
+    keep: bool,
     strict: bool,
     output: Path,
     **chosen: Any,
@@ -334,8 +336,9 @@ def register(
         raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
     options = _given(chosen)
     begin = Start(start, landmarks or None, align is not None, frame_landmarks or None)
-    if idle is not None and not watch:
-        raise ConfigError("--idle: expected --watch beside it.")
+    beside = {"--idle": idle is not None, "--learn": learn, "--keep": keep}
+    if not watch and (alone := [name for name, is_given in beside.items() if is_given]):
+        raise ConfigError(f"{alone[0]}: expected --watch beside it.")
     if not watch and any(name.startswith(f"{SCHEME}://") for name in clouds):
         raise ConfigError(f"CLOUDS: expected --watch beside a place of OpenIGTLink, got {clouds[0]} without it.")
     if watch:
@@ -345,7 +348,7 @@ def register(
             raise ConfigError("--watch: expected one folder or igtl://... and no --truth.")
         verdicts = watch_source(
             twin, parse_source(clouds[0]), output, options, unit=unit, axes=frame, start=begin, formats=formats,
-            budget=budget, idle=idle, say=click.echo,
+            budget=budget, idle=idle, learn=learn, keep=keep, say=click.echo,
         )  # fmt: skip
     else:
         verdicts = register_files(

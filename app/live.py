@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +21,10 @@ from .record import Recorder, counts, describe
 from .register import Scene, Start, check_any, check_budget, name_of, registered, say_coordinates
 from .sources import check_idle, opened
 from .streams import Clock, Mailbox
-from .twin import Camera, Sequence, Twin
+from .twin import Camera, Learner, Sequence, Twin
+
+if TYPE_CHECKING:
+    from .learning import BackgroundLearner
 
 
 def answers(
@@ -64,6 +67,7 @@ def register_live(
     budget: float | None = None,
     frame_landmarks: LandmarkFiles | None = None,
     reply: Reply | None = None,
+    learner: Learner | None = None,
     say: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
     """Register what comes into a mailbox and write each frame as it is found; returns the figures of all frames.
@@ -78,6 +82,7 @@ def register_live(
         budget: as for `answers`.
         frame_landmarks: landmarks that pull beside clouds in files.
         reply: is given each answer and its figures before files are written.
+        learner: as for `Sequence`.
         say: prints one line a frame.
 
     Raises:
@@ -87,7 +92,7 @@ def register_live(
     if frame_landmarks is not None:
         frame_landmarks.check(twin)
     with (
-        closing(Sequence(twin, zone, camera, is_live=True)) as sequence,
+        closing(Sequence(twin, zone, camera, is_live=True, learner=learner)) as sequence,
         Recorder(Exporter(twin, output, formats), zone) as recorder,
     ):
         for answer in answers(sequence, box, budget, frame_landmarks=frame_landmarks):
@@ -123,6 +128,8 @@ def watch_source(
     formats: tuple[str, ...] = (),
     budget: float | None = None,
     idle: float | None = None,
+    learn: bool = False,
+    keep: bool = False,
     say: Callable[[str], None] = print,
 ) -> dict[str, int]:
     """Register the clouds of a source, the newest first; returns how many frames bear each verdict.
@@ -140,6 +147,8 @@ def watch_source(
         formats: of the files of each frame; VTU and VTP if none.
         budget: as for `answers`.
         idle: seconds without a cloud after which the watch ends; never if not given.
+        learn: adapt the surrogate in a second process while frames come.
+        keep: put what was learned into the twin at the end.
         say: prints a line.
 
     Raises:
@@ -147,6 +156,8 @@ def watch_source(
     """
     check_budget(budget)
     check_idle(idle)
+    if keep and not learn:
+        raise ConfigError("--keep: expected --learn beside it.")
     if isinstance(source, Address):
         unit, axes = unit or "mm", axes or "ras"
     elif source.exists() and not source.is_dir():
@@ -162,12 +173,36 @@ def watch_source(
     with scene.opened(start, say) as (twin, camera):
         say_coordinates(twin, say)
         twin.registrar()  # prepared before the first cloud is waited for
-        with opened(source, scene, twin, idle, say) as feed:
+        with _learning(twin, learn, say) as learner, opened(source, scene, twin, idle, say) as feed:
             rows = register_live(
                 twin, feed.box, output, camera=camera, formats=formats or WRITTEN, budget=budget,
-                frame_landmarks=frame_landmarks, reply=feed.reply, say=say,
+                frame_landmarks=frame_landmarks, reply=feed.reply, learner=learner, say=say,
             )  # fmt: skip
             say(keeping_up(rows))
             if told := feed.summary():
                 say(told)
+            if learner is not None:
+                say(str(learner))
+            if keep and learner is not None:
+                _keep(learner, scene.home.folder, say)
     return counts(rows)
+
+
+@contextmanager
+def _learning(twin: Twin, learn: bool, say: Callable[[str], None]) -> Iterator[BackgroundLearner | None]:
+    if not learn:
+        yield None
+        return
+    from .learning import BackgroundLearner  # torch is needed here alone
+
+    with BackgroundLearner(twin, say=say) as learner:
+        yield learner
+
+
+def _keep(learner: BackgroundLearner, folder: Path, say: Callable[[str], None]) -> None:
+    try:
+        is_kept = learner.keep(folder)
+    except OSError as error:
+        say(f"--keep: {folder} cannot be written ({error}); the twin is as it was")
+        return
+    say(f"kept in {folder}; as it was built: {folder / 'as-built'}" if is_kept else "nothing to keep")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -9,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -226,6 +227,83 @@ class Twin:
             return None  # bounds are of the tissue that was learned, and not of one that was estimated
         return self._certifier.bound_error((found.draft or found).forces) if card.get("certificate") else None
 
+    @property
+    def network(self) -> Surrogate:
+        """The surrogate that predicts, or that registers first where the engine is hybrid.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        from softtwin.surrogate.loaded import LoadedSurrogate  # torch is needed here alone
+        from softtwin.surrogate.model import Surrogate
+
+        model = self._fast or self.model
+        found = model.surrogate if isinstance(model, LoadedSurrogate) else model
+        if not isinstance(found, Surrogate):
+            raise ConfigError(
+                f"registration.model: expected a twin that registers with its surrogate (surrogate or hybrid), got "
+                f"{self.config.registration.model}."
+            )
+        return found
+
+    @property
+    def known_forces(self) -> Floats | None:
+        """Nodal forces that the surrogate is asked for beside all others, (n, 3), newtons; None without any."""
+        known: Floats | None = getattr(self._fast or self.model, "known", None)
+        return known
+
+    def with_network(self, network: Surrogate) -> Twin:
+        """The same with a surrogate that has learned more since, ready for the zones and the pose that are in use.
+
+        It shares everything else with this twin, and is closed with it: see `adopt`.
+
+        Args:
+            network: of the same body.
+
+        Raises:
+            ConfigError: a twin without a surrogate, or one whose contact is of unknown place.
+        """
+        from softtwin.surrogate.loaded import LoadedSurrogate
+
+        before, known = self.network, self.known_forces
+        if network.body.fingerprint != before.body.fingerprint:
+            raise ConfigError("Twin.with_network: expected a surrogate of the twin's body, got one of another.")
+        new: Surrogate | LoadedSurrogate = network if known is None else LoadedSurrogate(network, known)
+
+        def renewed(engine: Engine) -> Engine:
+            if isinstance(engine, ContactRegistrar):
+                raise ConfigError("Twin.with_network: expected forces in known places, got a contact of unknown place.")
+            return engine.with_fast(new) if isinstance(engine, HybridRegistrar) else engine.with_model(new)
+
+        other = copy.copy(self)
+        other._model, other._fast = (new, None) if self._fast is None else (self._model, new)
+        other._registrars = {zone: renewed(engine) for zone, engine in list(self._registrars.items())}
+        posed = self._posed
+        other._posed = None if posed is None else (posed[0], posed[1], renewed(posed[2]))
+        if "_certifier" in self.__dict__ and network.card.get("certificate"):
+            other._certifier = self._certifier.of(network)
+        return other
+
+    def adopt(self, other: Twin) -> None:
+        """Become what `with_network` has made of this twin: for the next frame, whole or not at all.
+
+        What was prepared for other zones or poses since is prepared anew where it is asked for.
+
+        Args:
+            other: made by this twin.
+        """
+        self.__dict__.update(other.__dict__)
+        if "_certifier" not in other.__dict__:
+            self.__dict__.pop("_certifier", None)
+
+    def recertify(self, certificate: Mapping[str, Any]) -> None:
+        """Take other bounds of the surrogate's error, such as tests of its answers have asked for.
+
+        Args:
+            certificate: entry of a card.
+        """
+        self._certifier = self._certifier.with_certificate(certificate)
+
     @cached_property
     def _certifier(self) -> ErrorEstimator:
         from softtwin.surrogate.error_bound import ErrorEstimator  # torch is needed here alone
@@ -236,6 +314,12 @@ class Twin:
         if not isinstance(network, Surrogate):
             raise CalibrationError(f"Twin.bound_error: expected a twin with a network, got {type(network).__name__}.")
         return ErrorEstimator(network)
+
+    @property
+    def certificate(self) -> dict[str, Any] | None:
+        """Bounds of the surrogate's error as they are now; None where it has none, or known loads act beside."""
+        model: Any = self._fast or self.model
+        return self._certifier.certificate if getattr(model, "card", {}).get("certificate") else None
 
     def register(
         self,
@@ -591,6 +675,16 @@ def _registrar(engine: Engine) -> Registrar:
     return engine
 
 
+class Learner(Protocol):
+    """What learns while frames come: see `softtwin.app.learning.BackgroundLearner`."""
+
+    def renew(self) -> None:
+        """Before a frame: give the twin what was learned since the last one."""
+
+    def tell(self, frame: Frame) -> None:
+        """After a frame: what was found."""
+
+
 class Sequence:
     """Frames of one twin, each registered from what the last usable one found.
 
@@ -600,10 +694,19 @@ class Sequence:
         camera: where the camera stands.
         is_live: no answer waits for a search from rest, which a twin whose model is a network does beside the frames;
             what is found when depends on time then.
+        learner: is told of each frame, and may renew the twin between two of them; none if not given.
     """
 
-    def __init__(self, twin: Twin, zone: str | None = None, camera: Camera = None, *, is_live: bool = False) -> None:
-        self.twin, self.zone, self.camera = twin, zone, camera
+    def __init__(
+        self,
+        twin: Twin,
+        zone: str | None = None,
+        camera: Camera = None,
+        *,
+        is_live: bool = False,
+        learner: Learner | None = None,
+    ) -> None:
+        self.twin, self.zone, self.camera, self._learner = twin, zone, camera, learner
         self._count = 0
         engine = twin.registrar(zone)  # a zone that is not there is said before the first cloud
         is_concurrent = isinstance(engine, Registrar) and bool(getattr(engine.model, "is_concurrent", False))
@@ -632,6 +735,8 @@ class Sequence:
             ConfigError, ValueError: landmarks or terms that the twin cannot take.
         """
         begin = time.perf_counter()
+        if self._learner is not None:
+            self._learner.renew()
         try:
             given = self._thinned(cloud)
             points = given.array()
@@ -642,7 +747,10 @@ class Sequence:
             return self.refuse(str(error), time.perf_counter() - begin)
         count = 0 if landmarks is None else len(np.asarray(landmarks[0]))
         seconds = time.perf_counter() - begin
-        return Frame(self._next(), result.judgement, result, seconds, points[:, :3], count, given.missing)
+        frame = Frame(self._next(), result.judgement, result, seconds, points[:, :3], count, given.missing)
+        if self._learner is not None:
+            self._learner.tell(frame)
+        return frame
 
     def _thinned(self, cloud: ArrayLike) -> Cloud:
         """Once for all that is tried with it; what is no cloud is left for the registrar to refuse."""

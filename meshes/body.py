@@ -127,6 +127,11 @@ class Body:
             object.__setattr__(self, "fractions", _checked_fractions(self.fractions, len(cells)))
         self._check_fixed()
 
+    def __reduce__(self) -> tuple[type[Body], tuple[Any, ...]]:
+        """Bodies can be sent to other processes, where they are checked anew."""
+        named = dict(self.node_sets), dict(self.surfaces), dict(self.inner)
+        return Body, (self.points, self.cells, *named, self.fractions, self.skin)
+
     def _check_fixed(self) -> None:
         if "fixed" not in self.node_sets:
             return

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from softtwin.reference.data.outcome import NotConverged
 
+from .forward import ForwardModel
 from .registrar import Registrar
 from .residuals.term import ResidualTerm
 from .result import Registration, badness
@@ -41,6 +42,10 @@ class HybridRegistrar:
     def observed(self) -> SurfaceDistance:
         """The observed side."""
         return self.exact.observed
+
+    def with_fast(self, model: ForwardModel) -> HybridRegistrar:
+        """The same with another fast model; see `Registrar.with_model`."""
+        return HybridRegistrar(self.fast.with_model(model), self.exact)
 
     def limited(self, until: float) -> HybridRegistrar:
         """The same, which begins no step after a time of the monotonic clock, seconds; see `Registrar.limited`.

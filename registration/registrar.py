@@ -139,6 +139,16 @@ class Registrar:
         other.setup = setup
         return other
 
+    def with_model(self, model: ForwardModel) -> Registrar:
+        """The same with another model of the same body, such as a surrogate that has learned more since.
+
+        Args:
+            model: the model; results of the one before it may be started from.
+        """
+        anywhere, other = self.anywhere, self._with(self.setup.with_model(model))
+        other.anywhere = None if anywhere is None else cache(lambda: anywhere().with_model(model))
+        return other
+
     def limited(self, until: float) -> Registrar:
         """The same, which begins no step after a time of the monotonic clock, seconds, and gives the best so far."""
         return self._with(self.setup.with_solver(until=until))

@@ -115,6 +115,20 @@ class Setup:
         solver: GaussNewton | LBFGS = replace(self.options.solver, **given)  # type: ignore[arg-type]
         return replace(self, options=replace(self.options, solver=solver))
 
+    def with_model(self, model: ForwardModel) -> Setup:
+        """The same with another model of the same body."""
+        other = Setup.of(
+            model,
+            self.observed,
+            self.forces,
+            self.options,
+            expectations=self.expectations,
+            pose=self.pose,
+            inputs=self.inputs,
+            blocks=self.blocks,
+        )
+        return replace(other, terms=self.terms)
+
     def prepared(self, forces: NodalForces) -> Prepared:
         """Other forces, with the model that they are reduced with."""
         return Prepared.of(self.model, self.observed, forces, self.inputs)

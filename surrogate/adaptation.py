@@ -20,7 +20,7 @@ from softtwin.reference.data.outcome import NotConverged
 from .architecture import AdaptableArchitecture
 from .calibration import needed, quantile
 from .error_bound import ERRORS, ErrorBound, ErrorEstimator
-from .error_indicators import Error
+from .error_indicators import Error, elastic_of
 from .exact_states import ExactStates
 from .model import Surrogate
 from .registry import ARCHITECTURES
@@ -61,6 +61,22 @@ class OnlineLearner:
     """
 
     def __init__(self, surrogate: Surrogate, seconds: float = 4.0, seed: int = 0) -> None:
+        self.check(surrogate)
+        kind = ARCHITECTURES[surrogate.card["architecture"]]
+        self._kind, self._seconds = cast("type[AdaptableArchitecture]", kind), seconds
+        self.built = self.current = surrogate
+        self._exact = ExactStates(surrogate, seed)
+        self._estimator = ErrorEstimator(surrogate) if surrogate.card.get("certificate") else None
+        self._known = self._rehearsal()
+        self._since, self.frames, self.explored, self.adaptations = 0, 0, 0, 0
+
+    @staticmethod
+    def check(surrogate: Surrogate) -> None:
+        """Refuse what cannot learn while it is used.
+
+        Raises:
+            ValueError, CalibrationError: as above.
+        """
         kind = ARCHITECTURES[surrogate.card["architecture"]]
         if not hasattr(kind, "adapted"):
             able = sorted(name for name, each in ARCHITECTURES.items() if hasattr(each, "adapted"))
@@ -70,21 +86,17 @@ class OnlineLearner:
             )
         if surrogate.card.get("plan", {}).get("vary"):
             raise ValueError("OnlineLearner.surrogate: expected a surrogate of one tissue, got one that takes several.")
-        self._kind, self._seconds = cast("type[AdaptableArchitecture]", kind), seconds
-        self.built = self.current = surrogate
-        self._exact = ExactStates(surrogate, seed)
-        self._estimator = ErrorEstimator(surrogate) if surrogate.card.get("certificate") else None
-        self._known = self._rehearsal()
-        self._since, self.frames, self.explored, self.adaptations = 0, 0, 0, 0
+        elastic_of(surrogate)
 
     # ------------------------------------------------------------------ what comes
 
-    def observe(self, forces: ArrayLike, displacement: ArrayLike | None = None) -> Observation:
+    def observe(self, forces: ArrayLike, displacement: ArrayLike | None = None, learn: bool = True) -> Observation:
         """A frame's load with its exact state: a test of the surrogate, then a lesson unless it is kept back.
 
         Args:
             forces: nodal forces, (n, 3), newtons.
             displacement: the exact state, (n, 3), metres; solved for if not given.
+            learn: keep it; a test alone takes a tenth of the time.
 
         Raises:
             ValueError: another shape, numbers that are not finite, forces on nodes that the surrogate never saw loaded,
@@ -94,8 +106,8 @@ class OnlineLearner:
         state = self._exact.frame(forces, displacement, self.current)
         error, bound = self._tested(state.load, state.displacement)
         self.frames += 1
-        self._since += 1
-        return Observation(error, bound, self._exact.keep(state))
+        self._since += learn
+        return Observation(error, bound, learn and self._exact.keep(state))
 
     def explore(self) -> bool:
         """Solve for a state that the loads may come to, and learn from it; False where there was none."""

@@ -69,6 +69,12 @@ class ErrorEstimator:
         """What it knows, as a card holds it."""
         return dict(self._known)
 
+    def with_certificate(self, certificate: Mapping[str, Any]) -> ErrorEstimator:
+        """The same with what another one knows of the same surrogate."""
+        other = copy.copy(self)
+        other._known = dict(certificate)
+        return other
+
     def of(self, surrogate: Surrogate) -> ErrorEstimator:
         """The same powers and quantiles for a surrogate that was adapted; those of Newton's steps are not known."""
         other = copy.copy(self)

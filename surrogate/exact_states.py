@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -24,9 +24,11 @@ Floats = NDArray[np.float64]
 _KEPT_BACK = 3  # one state in so many is never learned from
 _NEWEST, _COMPARED = 48, 24  # states that are learned from; those kept back that adaptations are compared by
 _WAY = 64  # frames whose loads say where the next may lie
-_WIDER, _FARTHER = 4.0, 1.2  # in each direction than these loads lie; than the farthest of them in any
+_WIDER, _FARTHER = 4.0, 1.5  # in each direction than these loads lie; than the farthest of them in any
 _DIRECTIONS, _LEAST_EXTENT = 4, 0.03  # of the loads, at most; of the farthest, at least
 _PUSH = 0.1  # of the farthest load: a small change, for which the first order does
+_OTHERS = 48  # changes by loads of the training's kind
+_BESIDE = 1.5  # of what the directions leave of the loads
 _TOLERANCE = 1e-7  # of Newton's method, relative to the load
 _BALANCED = 1e-2  # forces out of balance, relative to the load, of what is no state of this body
 
@@ -56,11 +58,13 @@ class Collected:
         self.kept_back: deque[ExactState] = deque(maxlen=_COMPARED)
         self._count = 0
 
-    def take(self, state: ExactState) -> bool:
-        """Whether the state is kept back."""
+    def take(self, state: EquilibriaState, changes: Callable[[EquilibriaState], tuple[Floats, Floats]]) -> bool:
+        """Whether the state is kept back; its first-order changes are looked for if it is not."""
         self._count += 1
         is_kept_back = self._count % _KEPT_BACK == 0
-        (self.kept_back if is_kept_back else self.learned).append(state)
+        nothing = np.zeros((0, state.displacement.size))
+        pair = (nothing, nothing) if is_kept_back else changes(state)
+        (self.kept_back if is_kept_back else self.learned).append(ExactState(state.load, state.displacement, *pair))
         return is_kept_back
 
 
@@ -90,8 +94,9 @@ class ExactStates:
         self.frames, self.ahead = Collected(), Collected()
 
     def __iter__(self) -> Iterator[ExactState]:
-        for some in (self.ahead, self.frames):
-            yield from some.learned
+        """Those that are learned from."""
+        yield from self.ahead.learned
+        yield from self.frames.learned
 
     @property
     def kept_back(self) -> Sequence[ExactState]:
@@ -140,12 +145,12 @@ class ExactStates:
     def keep(self, state: EquilibriaState) -> bool:
         """Collect a frame's state; whether it is kept back."""
         self._way.append(state.load)
-        return self.frames.take(self._with_changes(state))
+        return self.frames.take(state, self._changes)
 
     def _check_balance(self, load: Floats, displacement: Floats) -> None:
         free = np.setdiff1d(np.arange(len(load)), self._surrogate.body.fixed)
         inner = self.elastic.internal_forces(torch.from_numpy(displacement[None]))[0].numpy()
-        missing, size = np.linalg.norm((inner - load)[free]), np.linalg.norm(load[free])
+        missing, size = float(np.linalg.norm((inner - load)[free])), float(np.linalg.norm(load[free]))
         if not missing <= _BALANCED * size:
             raise ValueError(
                 "OnlineLearner.displacement: expected an equilibrium of the surrogate's body and material, got forces "
@@ -162,21 +167,24 @@ class ExactStates:
         """
         if not self._way:
             return False
-        directions, extents = self._directions()
-        if not len(directions):
+        axes = self._axes
+        if len(axes.extents) == 0:
             return False
-        place = self._rng.standard_normal(len(extents))
-        place *= self._rng.uniform() ** (1.0 / len(place)) / np.linalg.norm(place)
-        load = np.einsum("k,kni->ni", place * extents, directions)
+        place = self._rng.standard_normal(len(axes.extents))
+        place *= float(self._rng.uniform()) ** (1.0 / len(place)) / float(np.linalg.norm(place))
+        reach = np.minimum(_WIDER * axes.extents, _FARTHER * axes.extents.max())
+        load = np.einsum("k,kni->ni", place * reach, axes.directions)
+        shares = _BESIDE / np.sqrt(len(axes.rest)) * self._rng.standard_normal(len(axes.rest))
+        load += np.einsum("w,wni->ni", shares, axes.rest)
         try:
             found = self._solved(self._hasty, load, guess)
         except NotConverged:
             return False
-        self.ahead.take(self._with_changes(found))
+        self.ahead.take(found, self._changes)
         return True
 
-    def _directions(self) -> tuple[Floats, Floats]:
-        """Directions of the newest loads, (k, n, 3), and how far each is to be looked at, (k,)."""
+    @property
+    def _axes(self) -> _Axes:
         loads, response = np.stack(self._way), self._surrogate.encoder_decoder.linear
         fields = response(loads.reshape(len(loads), -1)[:, self._surrogate.rows].T)
         squares, turned = np.linalg.eigh(fields.T @ fields)
@@ -184,7 +192,18 @@ class ExactStates:
         extents = values * np.abs(turned).max(axis=0)
         kept = np.flatnonzero(extents > _LEAST_EXTENT * extents.max())[:_DIRECTIONS]
         directions = np.einsum("wk,wni->kni", turned[:, kept] / values[kept], loads)
-        return directions, np.minimum(_WIDER * extents[kept], _FARTHER * extents.max())
+        return _Axes(
+            directions, extents[kept], loads - np.einsum("wk,kni->wni", turned[:, kept] * values[kept], directions)
+        )
+
+    def _others(self, count: int) -> Floats:
+        """Loads of the training's kind, (count, n, 3), whose linear responses have norm one."""
+        maps, found = self._surrogate.encoder_decoder, np.zeros((count, self._surrogate.body.points.size))
+        if maps.load_modes is None:
+            return found.reshape(count, -1, 3)
+        loads = maps.load_modes @ self._rng.standard_normal((maps.load_modes.shape[1], count))
+        found[:, self._surrogate.rows] = (loads / np.linalg.norm(maps.linear(loads), axis=0)).T
+        return found.reshape(count, -1, 3)
 
     # ------------------------------------------------------------------ states
 
@@ -193,11 +212,10 @@ class ExactStates:
         starts = []
         with suppress(NotConverged):
             starts.append(guess.solve(load).displacement)
-        every = (*self, *self.kept_back)
-        near = min(every, key=lambda each: float(np.linalg.norm(each.forces - load)), default=None)
+        near = min(self, key=lambda each: float(np.linalg.norm(each.forces - load)), default=None)
         if near is not None:
-            known = EquilibriaState(model, self._solver, near.forces, near.forces, near.displacement)
-            starts.append(known.displacement + known.jvp((load - near.forces).reshape(-1, 1)).reshape(-1, 3))
+            shares = np.linalg.lstsq(near.pushes.T, (load - near.forces).ravel(), rcond=1e-6)[0]
+            starts.append(near.displacement + (shares @ near.changes).reshape(-1, 3))
         start = None
         if starts:
             stored = self.elastic.energy_and_forces(torch.from_numpy(np.stack(starts)))[0].numpy()
@@ -208,10 +226,26 @@ class ExactStates:
             raise NotConverged("OnlineLearner: the state that was found is not stable; nothing is learned from it.")
         return state
 
-    def _with_changes(self, state: EquilibriaState) -> ExactState:
-        directions, extents = self._directions()
-        pushes = _PUSH * extents.max(initial=0.0) * directions.reshape(len(directions), -1)
-        return ExactState(state.load, state.displacement, pushes, state.jvp(pushes.T).T)
+    def _changes(self, state: EquilibriaState) -> tuple[Floats, Floats]:
+        axes = self._axes
+        every = np.concatenate([axes.directions, self._others(_OTHERS)])
+        pushes = _PUSH * axes.extents.max(initial=0.0) * every.reshape(len(every), -1)
+        return pushes, state.jvp(pushes.T).T
+
+
+@dataclass(frozen=True, eq=False)
+class _Axes:
+    """Principal axes of the newest loads, told apart by the displacements that they cause.
+
+    Args:
+        directions: loads whose linear responses have norm one, (k, n, 3).
+        extents: the largest coordinate of the newest loads along each, (k,).
+        rest: what these loads have beside, (w, n, 3).
+    """
+
+    directions: Floats
+    extents: Floats
+    rest: Floats
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,8 @@ _STATES = 48  # of typical loads, that the cells are chosen by
 _SKETCH = 5000  # combinations of what the cells are chosen by (count sketch: Charikar, Chen, Farach-Colton 2004)
 _OWN, _TANGENTS = 32, 24  # equilibria, at most, that the basis is told of, and whose tangents
 # Adapting while it is used: modes that are pushed, at so many states; modes and cells then.
-_PUSHED, _PUSHED_AT, _NEW_MODES, _NEW_CELLS, _NEW_TOLERANCE = 16, 4, 24, 450, 0.002
+_PUSHED, _PUSHED_AT, _NEW_MODES, _NEW_CELLS, _NEW_TOLERANCE = 16, 4, 36, 600, 0.001
+_CHANGES, _SEEN = 6, 64  # changes of each state that modes are told of; newest states that cells are chosen by
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +287,7 @@ class Galerkin:
         assert old is not None
         law = bytes(network.law.tolist()).decode()
         own, pushed = lesson.displacements, [lesson.displacements / _root_sizes(lesson.displacements)]
-        changes = np.concatenate(lesson.changes)
+        changes = np.concatenate([each[:_CHANGES] for each in lesson.changes])
         pushed.append(changes / _root_sizes(changes))
         forces = elastic.stiffness(torch.zeros(elastic.nodes, 3, dtype=torch.float64)) @ old[:, :_PUSHED]
         for place in np.unique(np.linspace(0, len(own) - 1, _PUSHED_AT).astype(int)):
@@ -298,7 +299,7 @@ class Galerkin:
         basis = np.hstack([old, np.linalg.qr(more)[0]])
         basis.reshape(-1, 3, basis.shape[1])[~elastic.free[:, 0].numpy().astype(bool)] = 0.0
         settings = Galerkin(cells=_NEW_CELLS, tolerance=_NEW_TOLERANCE)
-        found = settings._network(law, elastic, basis, [np.concatenate([own, lesson.known_displacements])], [])
+        found = settings._network(law, elastic, basis, [np.concatenate([own[-_SEEN:], lesson.known_displacements])], [])
         at_loaded = basis.reshape(-1, 3, basis.shape[1])[encoder_decoder.loaded].reshape(-1, basis.shape[1])
         return replace(encoder_decoder, encode=np.ascontiguousarray(at_loaded.T), decode=basis), found
 

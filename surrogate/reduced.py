@@ -480,24 +480,24 @@ def _lesson(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Coordinates, (s, r), corrections, (s, r), and weights, (s,), of all symmetric images: new ones first."""
     assert encoder_decoder.decode is not None
-    loads, displacements = [lesson.loads], [lesson.displacements]
+    new_loads, new_states = [lesson.loads], [lesson.displacements]
     for load, state, pushes, changes in zip(
         lesson.loads, lesson.displacements, lesson.pushes, lesson.changes, strict=True
     ):
-        loads += [load + pushes, load - pushes]
-        displacements += [state + changes, state - changes]
-    pairs = (np.concatenate(loads), np.concatenate(displacements)), (lesson.known_loads, lesson.known_displacements)
+        new_loads += [load + pushes, load - pushes]
+        new_states += [state + changes, state - changes]
+    new = np.concatenate(new_loads), np.concatenate(new_states)
+    known = lesson.known_loads, lesson.known_displacements
+    mean = float(np.mean(np.concatenate([np.square(each[1]).sum(axis=1) for each in (new, known)])))
     turns, parts = network.turns.numpy(), []
-    squares = np.concatenate([(displacements**2).sum(axis=1) for _, displacements in pairs])
-    mean = squares.mean()
-    for loads, displacements in pairs:
+    for loads, states in (new, known):
         coordinates = encoder_decoder.encoded(loads.T).T
-        corrections = (displacements - encoder_decoder.linear(loads.T).T) @ encoder_decoder.decode
-        sizes = np.sqrt((displacements**2).sum(axis=1) * mean)
+        corrections = (states - encoder_decoder.linear(loads.T).T) @ encoder_decoder.decode
+        weights = 1.0 / (np.sqrt(np.square(states).sum(axis=1) * mean) + _LEAST_WEIGHED * mean)
         images = [
-            np.einsum("gij,sj->gsi", turns, each).reshape(-1, turns.shape[2]) for each in (coordinates, corrections)
+            np.einsum("gij,sj->gsi", turns, each).reshape(-1, len(turns[0])) for each in (coordinates, corrections)
         ]
-        parts.append((*images, np.tile(1.0 / (sizes + _LEAST_WEIGHED * mean), len(turns))))
+        parts.append((*images, np.tile(weights, len(turns))))
     whole = [_tensor(np.concatenate(each)) for each in zip(*parts, strict=True)]
     return whole[0], whole[1], whole[2]
 

@@ -17,7 +17,6 @@ from safetensors.numpy import save as save_tensors
 
 from softtwin.meshes.body import Body
 
-from .architecture import Network
 from .encoder_decoder import LinearEncoderDecoder
 from .model import Surrogate
 from .registry import ARCHITECTURES
@@ -35,16 +34,13 @@ class TwinError(ValueError):
     """A twin that cannot be used: missing, truncated, changed, or of another body."""
 
 
-def save(surrogate: Surrogate, folder: Path | str, single: bool = False) -> None:
-    """Write weights (safetensors) and card (JSON) into a folder; the body is written apart, with `meshes.io`.
+def packed(surrogate: Surrogate, single: bool = False) -> tuple[bytes, dict[str, Any]]:
+    """Weights, as the bytes of a safetensors file, and the card that goes with them: what `unpacked` takes.
 
     Args:
-        surrogate: what to save.
-        folder: made if it is not there; files of the same names are replaced.
-        single: round all numbers to single precision, for half of the size; `load` gives them back in double.
+        surrogate: what to pack.
+        single: as for `save`.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     tensors = {f"{_MAPS}{name}": array for name, array in surrogate.encoder_decoder.arrays().items()}
     tensors |= {f"{_NETWORK}{name}": tensor.numpy() for name, tensor in surrogate.network.state_dict().items()}
     if single:
@@ -58,19 +54,37 @@ def save(surrogate: Surrogate, folder: Path | str, single: bool = False) -> None
         **({"stored": "single"} if single else {}),
         "notice": NOTICE,
     }
-    _replace(folder / WEIGHTS, weights)
-    _replace(folder / CARD, json.dumps(card, indent=2, allow_nan=False).encode())
+    return weights, card
+
+
+def save(surrogate: Surrogate, folder: Path | str, single: bool = False) -> None:
+    """Write weights (safetensors) and card (JSON) into a folder; the body is written apart, with `meshes.io`.
+
+    Both are written before either takes the place of a file of its name: a full disk leaves what was there.
+
+    Args:
+        surrogate: what to save.
+        folder: made if it is not there; files of the same names are replaced.
+        single: round all numbers to single precision, for half of the size; `load` gives them back in double.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    weights, card = packed(surrogate, single)
+    contents = {WEIGHTS: weights, CARD: json.dumps(card, indent=2, allow_nan=False).encode()}
+    try:
+        for name, content in contents.items():
+            (folder / f"{name}.partial").write_bytes(content)
+    except OSError:
+        for name in contents:
+            (folder / f"{name}.partial").unlink(missing_ok=True)
+        raise
+    for name in contents:
+        os.replace(folder / f"{name}.partial", folder / name)
 
 
 def _as(array: NDArray[Any], kind: type[np.number[Any]], wanted: type[np.number[Any]]) -> NDArray[Any]:
     """An array of one kind as another; others as they are."""
     return array.astype(wanted) if array.dtype == kind else array
-
-
-def _replace(path: Path, content: bytes) -> None:
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
 
 
 def load(folder: Path | str, body: Body) -> Surrogate:
@@ -90,7 +104,24 @@ def load(folder: Path | str, body: Body) -> Surrogate:
             f"load.body: the twin in {folder} belongs to another body (fingerprint {card['body'][:12]}..., "
             f"got {body.fingerprint[:12]}...); nodes, cells and fixed nodes must be those it was trained on."
         )
-    tensors = _read_weights(folder / WEIGHTS, card["weights"])
+    return _revived(str(folder), _read_weights(folder / WEIGHTS, card["weights"]), card, body)
+
+
+def unpacked(weights: bytes, card: dict[str, Any], body: Body) -> Surrogate:
+    """The surrogate that `packed` has packed.
+
+    Args:
+        weights: of a safetensors file.
+        card: that goes with them.
+        body: the body that it was trained on.
+
+    Raises:
+        TwinError: another format than this program's.
+    """
+    return _revived("the bytes given", load_tensors(weights), card, body)
+
+
+def _revived(place: str, tensors: dict[str, NDArray[Any]], card: dict[str, Any], body: Body) -> Surrogate:
     if card.get("stored") == "single":
         tensors = {name: _as(array, np.float32, np.float64) for name, array in tensors.items()}
     encoder_decoder: dict[str, Any] = {
@@ -103,17 +134,13 @@ def load(folder: Path | str, body: Body) -> Surrogate:
         name.removeprefix(_NETWORK): torch.tensor(array) for name, array in tensors.items() if name.startswith(_NETWORK)
     }
     with torch.random.fork_rng(devices=[]):  # the weights are given: the caller's chance is left alone
-        network = _revived(folder, card["architecture"], weights)
+        try:
+            network = ARCHITECTURES[card["architecture"]].from_state_dict(weights)
+        except ValueError as error:
+            raise TwinError(
+                f"load.folder: the network in {place} is of a newer version of this program: {error}"
+            ) from error
     return Surrogate(body, LinearEncoderDecoder(**encoder_decoder), network, card)
-
-
-def _revived(folder: Path, architecture: str, weights: dict[str, torch.Tensor]) -> Network:
-    try:
-        return ARCHITECTURES[architecture].from_state_dict(weights)
-    except ValueError as error:
-        raise TwinError(
-            f"load.folder: the network in {folder} is of a newer version of this program: {error}"
-        ) from error
 
 
 def _read_card(path: Path) -> dict[str, Any]:
