@@ -37,7 +37,7 @@ _NICENESS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class _Lesson:
+class _Asked:
     """A frame's load, newtons, and its exact state, metres, (n, 3) each; None where that has to be solved for."""
 
     forces: Floats
@@ -48,7 +48,7 @@ class _Lesson:
 class _Tested:
     """Bounds as they are after a test of them, and what the test was."""
 
-    certificate: dict[str, Any] | None
+    known: dict[str, Any] | None
     error: float
     bound: float
 
@@ -114,10 +114,10 @@ class BackgroundLearner:
         _check(twin)
         self._twin, self._say = twin, say
         self._news = threading.Condition()
-        self._waiting: deque[_Lesson] = deque(maxlen=_WAITING)
+        self._waiting: deque[_Asked] = deque(maxlen=_WAITING)
         self._is_ready = self._is_closed = False
         self._next: Twin | None = None
-        self._certificate: dict[str, Any] | None = None
+        self._bounds: dict[str, Any] | None = None
         self.learned = Learned(0, 0, {}, 0, None)
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
@@ -152,11 +152,11 @@ class BackgroundLearner:
         """Give the twin what was learned since the last frame."""
         with self._news:
             renewed, self._next = self._next, None
-            certificate, self._certificate = self._certificate, None
+            known, self._bounds = self._bounds, None
         if renewed is not None:
             self._twin.adopt(renewed)
-        if certificate is not None and self._twin.certificate is not None:
-            self._twin.recertify(certificate)
+        if known is not None and self._twin.bounds is not None:
+            self._twin.take_bounds(known)
 
     def tell(self, frame: Frame) -> None:
         """Learn from a frame that is usable, when there is time.
@@ -171,7 +171,7 @@ class BackgroundLearner:
         forces = found.forces if known is None else found.forces + known
         is_exact = found.draft is not None and found.draft.forces is not found.forces
         with self._news:
-            self._waiting.append(_Lesson(forces, found.state.displacement if is_exact else None))
+            self._waiting.append(_Asked(forces, found.state.displacement if is_exact else None))
             self._news.notify_all()
 
     # ------------------------------------------------------------------ afterwards
@@ -208,8 +208,8 @@ class BackgroundLearner:
         card = {name: entry for name, entry in now.card.items() if name != "discrepancy"}
         known = before.card.get("discrepancy")
         card |= {} if known is None else {"discrepancy": known}
-        certificate = self._twin.certificate
-        card |= {} if certificate is None else {"certificate": certificate}
+        bounds = self._twin.bounds
+        card |= {} if bounds is None else {"certificate": bounds}
         save(Surrogate(now.body, maps, now.network, card), folder, single=before.card.get("stored") == "single")
         return True
 
@@ -233,11 +233,11 @@ class BackgroundLearner:
                 if self._is_closed:
                     return
                 # Without exact states the newest frame tells most: each costs the other process an equilibrium.
-                lessons = list(self._waiting) if self._waiting[-1].displacement is not None else [self._waiting[-1]]
+                asked = list(self._waiting) if self._waiting[-1].displacement is not None else [self._waiting[-1]]
                 self._waiting.clear()
                 self._is_ready = False
             with suppress(OSError):
-                self._pipe.send(lessons)
+                self._pipe.send(asked)
 
     def _listen(self) -> None:
         with suppress(EOFError, OSError):
@@ -258,7 +258,7 @@ class BackgroundLearner:
 
     def _hear_test(self, seen: _Tested) -> None:
         with self._news:
-            self._certificate = seen.certificate
+            self._bounds = seen.known
             self.learned.frames += 1
             self.learned.within += seen.error <= seen.bound
 
@@ -270,11 +270,14 @@ class BackgroundLearner:
 
     def _prepare(self, adapted: _Adapted) -> None:
         """In the thread: the twin with a surrogate, for `renew` to give."""
-        surrogate = unpacked(adapted.weights, adapted.card, self._twin.body)
-        renewed = self._twin.with_network(surrogate)
+        try:
+            renewed = self._twin.with_network(unpacked(adapted.weights, adapted.card, self._twin.body))
+        except (ValueError, NotConverged) as error:
+            self._hear_refusal(_Refused(str(error)))
+            return
         entry = adapted.card["adaptation"]
         with self._news:
-            self._next, self._certificate = renewed, None
+            self._next, self._bounds = renewed, None
             self.learned.adaptations += 1
             self.learned.errors = entry["relative_error_before"], entry["relative_error_after"]
         self._say(str(self))
@@ -320,16 +323,16 @@ def _work(pipe: Connection, learner: OnlineLearner) -> None:
             learner.explore()
             ahead += 1
         else:
-            lessons = pipe.recv()
-            for number, lesson in enumerate(lessons, 1):  # neighbours teach the same
-                pipe.send(_seen(learner, lesson, learn=number > len(lessons) - _LEARNED))
+            asked = pipe.recv()
+            for number, each in enumerate(asked, 1):  # neighbours teach the same
+                pipe.send(_seen(learner, each, learn=number > len(asked) - _LEARNED))
             ahead = 0
             pipe.send(_READY)
 
 
-def _seen(learner: OnlineLearner, lesson: _Lesson, learn: bool) -> _Tested | _Refused:
+def _seen(learner: OnlineLearner, asked: _Asked, learn: bool) -> _Tested | _Refused:
     try:
-        seen = learner.observe(lesson.forces, lesson.displacement, learn)
+        seen = learner.observe(asked.forces, asked.displacement, learn)
     except (ValueError, NotConverged) as error:
         return _Refused(str(error))
     return _Tested(learner.current.card.get("certificate"), seen.error["mean"], seen.bound["mean"])

@@ -296,13 +296,13 @@ class Twin:
         if "_certifier" not in other.__dict__:
             self.__dict__.pop("_certifier", None)
 
-    def recertify(self, certificate: Mapping[str, Any]) -> None:
+    def take_bounds(self, known: Mapping[str, Any]) -> None:
         """Take other bounds of the surrogate's error, such as tests of its answers have asked for.
 
         Args:
-            certificate: entry of a card.
+            known: as `bounds`.
         """
-        self._certifier = self._certifier.with_certificate(certificate)
+        self._certifier = self._certifier.with_known(known)
 
     @cached_property
     def _certifier(self) -> ErrorEstimator:
@@ -316,10 +316,10 @@ class Twin:
         return ErrorEstimator(network)
 
     @property
-    def certificate(self) -> dict[str, Any] | None:
-        """Bounds of the surrogate's error as they are now; None where it has none, or known loads act beside."""
+    def bounds(self) -> dict[str, Any] | None:
+        """What bounds of the surrogate's error are made of, now; None where it has none, or known loads act beside."""
         model: Any = self._fast or self.model
-        return self._certifier.certificate if getattr(model, "card", {}).get("certificate") else None
+        return self._certifier.known if getattr(model, "card", {}).get("certificate") else None
 
     def register(
         self,

@@ -97,7 +97,7 @@ class Said:
         error: mean distance of nodes from where they are, metres.
         forces: found, (n, 3), newtons; None without a result.
         surrogate: that was in force.
-        certificate: its bounds.
+        known: what its bounds were made of.
     """
 
     frame: int
@@ -107,7 +107,7 @@ class Said:
     error: float
     forces: Floats | None
     surrogate: Surrogate
-    certificate: dict[str, Any] | None
+    known: dict[str, Any] | None
 
 
 def watched(twin: Twin, clouds: list[Floats], states: list[Floats], rate: float, learner: Learner | None) -> list[Said]:
@@ -130,7 +130,7 @@ def watched(twin: Twin, clouds: list[Floats], states: list[Floats], rate: float,
             error = float(nodal_distances(registration.displacement[None], states[number][None]).mean())
         verdict = answer.frame.judgement.verdict.value
         found.append(
-            Said(number, time.monotonic() - start, answer.age, verdict, error, forces, twin.network, twin.certificate)
+            Said(number, time.monotonic() - start, answer.age, verdict, error, forces, twin.network, twin.bounds)
         )
     sequence.close()
     return found
@@ -156,7 +156,7 @@ def errors_of(asked: list[Said], pairs: list[tuple[Floats, Floats]]) -> tuple[Fl
         except NotConverged:
             held.append([False, False])
             continue
-        bound = estimator.of(each.surrogate).with_certificate(each.certificate or {}).bound_error(load, state)
+        bound = estimator.of(each.surrogate).with_known(each.known or {}).bound_error(load, state)
         apart = nodal_distances(state.displacement[None], exact[None])[0]
         held.append([apart.mean() <= bound.mean, apart.max() <= bound.largest])
     return np.array(before), np.array(now), np.array(held)

@@ -1,6 +1,6 @@
 """A surrogate that learns while it is used: from exact states of what it is asked, and of what it may be asked next.
 
-Each frame's exact state is a test before it is a lesson (prequential: Dawid 1984), and every third is never learned
+Each frame's exact state is a test before it is learned from (prequential: Dawid 1984), and every third is never learned
 from. Bounds follow what the tests say by online quantile tracking (Gibbs and Candes 2021; Angelopoulos, Candes and
 Tibshirani 2023), which holds the share wanted however the loads drift; after each adaptation they begin with the split
 conformal quantile of the states that were kept back.
@@ -91,7 +91,7 @@ class OnlineLearner:
     # ------------------------------------------------------------------ what comes
 
     def observe(self, forces: ArrayLike, displacement: ArrayLike | None = None, learn: bool = True) -> Observation:
-        """A frame's load with its exact state: a test of the surrogate, then a lesson unless it is kept back.
+        """A frame's load with its exact state: a test of the surrogate, then learned from unless it is kept back.
 
         Args:
             forces: nodal forces, (n, 3), newtons.
@@ -128,7 +128,7 @@ class OnlineLearner:
         found = Surrogate(
             self.built.body,
             *self._kind.adapted(
-                self.built.encoder_decoder, self.current.network, self._exact.lesson(self._known, self._seconds)
+                self.built.encoder_decoder, self.current.network, self._exact.samples(self._known, self._seconds)
             ),
             self.built.card,
         )
@@ -159,7 +159,7 @@ class OnlineLearner:
             self._estimator = self._estimator.scaled(
                 {name: _raised(error[name] > bound[name], said) for name in ERRORS}
             )
-            self.current = self.current.with_card(certificate=self._estimator.certificate)
+            self.current = self.current.with_card(certificate=self._estimator.known)
         return error, bound
 
     def _error(self, surrogate: Surrogate) -> float:
@@ -224,7 +224,7 @@ class OnlineLearner:
             shown.append(estimator.reader.read(each.forces, state))
             missed.append(nodal_distances(state.displacement[None], each.displacement[None])[0])
         estimator = estimator.within(shown)
-        confidence = estimator.certificate["confidence"]
+        confidence = estimator.known["confidence"]
         if len(shown) >= needed(confidence):
             factors = {}
             for name in ERRORS:
@@ -233,7 +233,7 @@ class OnlineLearner:
                 factors[name] = quantile(errors / said, confidence) or 1.0
             estimator = estimator.scaled(factors)
         self._estimator = estimator
-        return surrogate.with_card(certificate=estimator.certificate)
+        return surrogate.with_card(certificate=estimator.known)
 
 
 def _raised(is_missed: bool, said: ErrorBound) -> float:

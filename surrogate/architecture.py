@@ -174,11 +174,11 @@ class TrainedArchitecture(Architecture, Protocol):
         """A `TrainingObjective` with fresh weights."""
 
     def optimizer(self, network: Any, rate: float) -> torch.optim.Optimizer:
-        """What trains the lesson's network; its rate is set before every step."""
+        """What trains a new network; its rate is set before every step."""
 
 
 @dataclass(frozen=True, eq=False)
-class Lesson:
+class NewSamples:
     """What a network that is in use is to learn, beside what it knows.
 
     Args:
@@ -211,9 +211,9 @@ class AdaptableArchitecture(Architecture, Protocol):
 
     @staticmethod
     def adapted(
-        encoder_decoder: LinearEncoderDecoder, network: Any, lesson: Lesson
+        encoder_decoder: LinearEncoderDecoder, network: Any, samples: NewSamples
     ) -> tuple[LinearEncoderDecoder, Network]:
-        """The maps and the network after a lesson; coordinates of the loads that are new come last."""
+        """The maps and the network after they have learned; coordinates of the loads that are new come last."""
 
 
 @runtime_checkable

@@ -65,14 +65,14 @@ class ErrorEstimator:
         self.reader = IndicatorReader(surrogate)
 
     @property
-    def certificate(self) -> dict[str, Any]:
+    def known(self) -> dict[str, Any]:
         """What it knows, as a card holds it."""
         return dict(self._known)
 
-    def with_certificate(self, certificate: Mapping[str, Any]) -> ErrorEstimator:
+    def with_known(self, known: Mapping[str, Any]) -> ErrorEstimator:
         """The same with what another one knows of the same surrogate."""
         other = copy.copy(self)
-        other._known = dict(certificate)
+        other._known = dict(known)
         return other
 
     def of(self, surrogate: Surrogate) -> ErrorEstimator:

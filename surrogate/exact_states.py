@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from softtwin.reference.data.loading import checked_array
 from softtwin.reference.data.outcome import NotConverged
 
-from .architecture import Lesson
+from .architecture import NewSamples
 from .equilibria import Equilibria, NewtonSettings
 from .equilibria_model import EquilibriaModel, EquilibriaState
 from .error_indicators import elastic_of
@@ -103,7 +103,7 @@ class ExactStates:
         """States that are not learned from."""
         return [*self.frames.kept_back, *self.ahead.kept_back]
 
-    def lesson(self, known: tuple[Floats, Floats], seconds: float) -> Lesson:
+    def samples(self, known: tuple[Floats, Floats], seconds: float) -> NewSamples:
         """What there is to learn.
 
         Args:
@@ -111,7 +111,7 @@ class ExactStates:
             seconds: that it may take.
         """
         states, rows = list(self), self._surrogate.rows
-        return Lesson(
+        return NewSamples(
             self.elastic,
             np.stack([each.forces.ravel()[rows] for each in states]),
             np.stack([each.displacement.ravel() for each in states]),

@@ -17,7 +17,7 @@ from softtwin.reference.data.materials import MATERIALS, Material, with_paramete
 from softtwin.reference.data.samplers import LoadPlan, draw_load, draw_smooth_load
 from softtwin.reference.data.springs import ligaments_of
 
-from .architecture import Lesson
+from .architecture import NewSamples
 from .cubature import sparse_weights
 from .encoder_decoder import LinearEncoderDecoder, response_parts
 from .modal_derivatives import FactoredTangent, leading_modes, modal_derivatives, without
@@ -274,20 +274,20 @@ class Galerkin:
 
     @staticmethod
     def adapted(
-        encoder_decoder: LinearEncoderDecoder, network: GalerkinNetwork, lesson: Lesson
+        encoder_decoder: LinearEncoderDecoder, network: GalerkinNetwork, samples: NewSamples
     ) -> tuple[LinearEncoderDecoder, GalerkinNetwork]:
         """With modes of equilibria that are new, and of how they change, and cells chosen anew by them.
 
         Args:
             encoder_decoder: the maps around the network.
             network: as it was made.
-            lesson: the equilibria.
+            samples: the equilibria.
         """
-        elastic, old = lesson.elastic, encoder_decoder.decode
+        elastic, old = samples.elastic, encoder_decoder.decode
         assert old is not None
         law = bytes(network.law.tolist()).decode()
-        own, pushed = lesson.displacements, [lesson.displacements / _root_sizes(lesson.displacements)]
-        changes = np.concatenate([each[:_CHANGES] for each in lesson.changes])
+        own, pushed = samples.displacements, [samples.displacements / _root_sizes(samples.displacements)]
+        changes = np.concatenate([each[:_CHANGES] for each in samples.changes])
         pushed.append(changes / _root_sizes(changes))
         forces = elastic.stiffness(torch.zeros(elastic.nodes, 3, dtype=torch.float64)) @ old[:, :_PUSHED]
         for place in np.unique(np.linspace(0, len(own) - 1, _PUSHED_AT).astype(int)):
@@ -299,7 +299,9 @@ class Galerkin:
         basis = np.hstack([old, np.linalg.qr(more)[0]])
         basis.reshape(-1, 3, basis.shape[1])[~elastic.free[:, 0].numpy().astype(bool)] = 0.0
         settings = Galerkin(cells=_NEW_CELLS, tolerance=_NEW_TOLERANCE)
-        found = settings._network(law, elastic, basis, [np.concatenate([own[-_SEEN:], lesson.known_displacements])], [])
+        found = settings._network(
+            law, elastic, basis, [np.concatenate([own[-_SEEN:], samples.known_displacements])], []
+        )
         at_loaded = basis.reshape(-1, 3, basis.shape[1])[encoder_decoder.loaded].reshape(-1, basis.shape[1])
         return replace(encoder_decoder, encode=np.ascontiguousarray(at_loaded.T), decode=basis), found
 

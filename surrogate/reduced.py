@@ -22,7 +22,7 @@ from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, LinearResponse, Samples, probe_cotangents
 from softtwin.reference.data.jacobians import Jacobians, read_jacobians
 
-from .architecture import Lesson, Linearisation, Network
+from .architecture import Linearisation, Network, NewSamples
 from .encoder_decoder import LinearEncoderDecoder, response_parts
 from .optimizers import MuonWithAdamW
 from .pod import ReducedBasis, basis_of, learned_basis, semi_relative, sizes_of
@@ -92,21 +92,21 @@ class Reduced:
 
     @staticmethod
     def adapted(
-        encoder_decoder: LinearEncoderDecoder, network: AveragedNetwork, lesson: Lesson
+        encoder_decoder: LinearEncoderDecoder, network: AveragedNetwork, samples: NewSamples
     ) -> tuple[LinearEncoderDecoder, AveragedNetwork]:
         """Trained on from its weights, on equilibria with their first-order changes, and on what it was built to know.
 
         Args:
             encoder_decoder: the maps around the network.
             network: as it was made.
-            lesson: the equilibria.
+            samples: the equilibria.
         """
-        loads, targets, weights = _lesson(encoder_decoder, network, lesson)
+        loads, targets, weights = _images_of(encoder_decoder, network, samples)
         inner = ReducedNetwork(
             network.input_scale.float(), float(network.output_scale), network.enter.out_features, len(network.inner)
         )
         inner.load_state_dict({name: network.state_dict()[name].float() for name in inner.state_dict()})
-        new, chance = len(loads) - len(network.turns) * len(lesson.known_loads), torch.Generator().manual_seed(0)
+        new, chance = len(loads) - len(network.turns) * len(samples.known_loads), torch.Generator().manual_seed(0)
         optimizer, begin, used = torch.optim.Adam(inner.parameters(), lr=_RATE), time.monotonic(), 0.0
         while used < 1.0:
             for group in optimizer.param_groups:
@@ -121,7 +121,7 @@ class Reduced:
             missed = (inner(loads[batch]) - targets[batch]).square().sum(dim=1)
             (missed * weights[batch]).mean().backward()
             optimizer.step()
-            used = (time.monotonic() - begin) / max(lesson.seconds, 1e-9)
+            used = (time.monotonic() - begin) / max(samples.seconds, 1e-9)
         trained = AveragedNetwork(inner.double(), network.turns).requires_grad_(False)
         return encoder_decoder, trained
 
@@ -475,19 +475,19 @@ def _corrections(response: LinearResponse, samples: Samples) -> Floats:
     return samples.displacements - response.apply(samples.forces)
 
 
-def _lesson(
-    encoder_decoder: LinearEncoderDecoder, network: AveragedNetwork, lesson: Lesson
+def _images_of(
+    encoder_decoder: LinearEncoderDecoder, network: AveragedNetwork, samples: NewSamples
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Coordinates, (s, r), corrections, (s, r), and weights, (s,), of all symmetric images: new ones first."""
     assert encoder_decoder.decode is not None
-    new_loads, new_states = [lesson.loads], [lesson.displacements]
+    new_loads, new_states = [samples.loads], [samples.displacements]
     for load, state, pushes, changes in zip(
-        lesson.loads, lesson.displacements, lesson.pushes, lesson.changes, strict=True
+        samples.loads, samples.displacements, samples.pushes, samples.changes, strict=True
     ):
         new_loads += [load + pushes, load - pushes]
         new_states += [state + changes, state - changes]
     new = np.concatenate(new_loads), np.concatenate(new_states)
-    known = lesson.known_loads, lesson.known_displacements
+    known = samples.known_loads, samples.known_displacements
     mean = float(np.mean(np.concatenate([np.square(each[1]).sum(axis=1) for each in (new, known)])))
     turns, parts = network.turns.numpy(), []
     for loads, states in (new, known):

@@ -91,16 +91,16 @@ def test_every_third_state_is_never_learned_from(network: Surrogate, data: DataS
     pairs = way(network, data, 12)
     kept = [learner.observe(*pair).is_kept_back for pair in pairs]
     assert kept == [False, False, True] * 4
-    lesson = learner._exact.lesson(learner._known, 1.0)
+    new = learner._exact.samples(learner._known, 1.0)
     for (_, state), is_kept_back in zip(pairs, kept, strict=True):
-        assert is_kept_back != any(np.array_equal(each, state.ravel()) for each in lesson.displacements)
+        assert is_kept_back != any(np.array_equal(each, state.ravel()) for each in new.displacements)
 
 
 def test_what_does_no_better_is_not_taken(network: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
     learner = OnlineLearner(network)
     for pair in way(network, data, 12):
         learner.observe(*pair)
-    monkeypatch.setattr(learner._kind, "adapted", lambda maps, same, lesson: (maps, same))
+    monkeypatch.setattr(learner._kind, "adapted", lambda maps, same, new: (maps, same))
     assert learner.adapt() is None and learner.current.network is network.network
     assert not learner.is_due and learner.adaptations == 0
 
