@@ -78,7 +78,7 @@ class Learned:
     Args:
         frames: whose exact states have tested the surrogate.
         within: of these, how many mean errors were within their bounds.
-        refused: what was not learned from, by reason.
+        refused: what was not learned from: how often, by reason.
         adaptations: how often the surrogate was exchanged.
         errors: relative errors on states that were kept back, before and after the last of them.
     """
@@ -263,8 +263,9 @@ class BackgroundLearner:
             self.learned.within += seen.error <= seen.bound
 
     def _hear_refusal(self, refused: _Refused) -> None:
-        count = self.learned.refused.get(refused.reason, 0)
-        self.learned.refused[refused.reason] = count + 1
+        kind = refused.reason.partition(", got ")[0]  # figures differ from frame to frame
+        count = self.learned.refused.get(kind, 0)
+        self.learned.refused[kind] = count + 1
         if not count:
             self._say(f"not learned from: {refused.reason}")
 

@@ -124,6 +124,8 @@ class OnlineLearner:
     def adapt(self) -> Surrogate | None:
         """A surrogate that has learned from what has come; None where it does no better on what was kept back."""
         self._since = 0
+        if not self._exact.kept_back:
+            return None
         before = self._error(self.current)
         found = Surrogate(
             self.built.body,
