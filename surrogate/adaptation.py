@@ -2,8 +2,8 @@
 
 Each frame's exact state is a test before it is learned from (prequential: Dawid 1984), and every third is never learned
 from. Bounds follow what the tests say by online quantile tracking (Gibbs and Candes 2021; Angelopoulos, Candes and
-Tibshirani 2023), which holds the share wanted however the loads drift; after each adaptation they begin with the split
-conformal quantile of the states that were kept back.
+Tibshirani 2023), which holds the share wanted however the loads drift; an adaptation leaves them at least as wide as
+the split conformal quantile of the frames that were kept back.
 """
 
 from __future__ import annotations
@@ -216,7 +216,11 @@ class OnlineLearner:
         return Surrogate(surrogate.body, encoder_decoder, surrogate.network, {**surrogate.card, "domain": entry})
 
     def _recalibrated(self, surrogate: Surrogate) -> Surrogate:
-        """With bounds that hold on what was kept back, where that is enough to say so; else as wide as before."""
+        """With bounds that hold on what was kept back, where that is enough to say so, and that are as wide as before.
+
+        What is kept back lies between what was learned, and frames to come do not: it may widen bounds, and only tests
+        narrow them. Their indicators tell by themselves that predictions are better in balance now.
+        """
         if self._estimator is None:
             return surrogate
         estimator = self._estimator.of(surrogate)
@@ -232,7 +236,7 @@ class OnlineLearner:
             for name in ERRORS:
                 errors = np.array([apart.mean() if name == "mean" else apart.max() for apart in missed])
                 said = np.array([getattr(estimator.read(indicators), name) for indicators in shown])
-                factors[name] = quantile(errors / said, confidence) or 1.0
+                factors[name] = max(1.0, quantile(errors / said, confidence) or 1.0)
             estimator = estimator.scaled(factors)
         self._estimator = estimator
         return surrogate.with_card(certificate=estimator.known)
