@@ -136,7 +136,7 @@ def test_twins_that_cannot_learn_say_why(small_quickstart: Path, monkeypatch: py
             BackgroundLearner(twin)
 
     refused("expected a twin that registers with its surrogate", "torch")
-    refused("expected forces as all that is unknown", "hybrid", parameters=["young-modulus"])
+    refused("expected forces in known places as all that is unknown", "hybrid", parameters=["young-modulus"])
     monkeypatch.setattr(learning.OnlineLearner, "check", lambda surrogate: (_ for _ in ()).throw(ValueError("no way")))
     refused("--learn: no way")
 
