@@ -51,7 +51,7 @@ def until(happens: Callable[[], bool], meanwhile: Callable[[], object]) -> None:
         meanwhile()
 
 
-@pytest.mark.parametrize("engine", ["surrogate", "hybrid"])
+@pytest.mark.parametrize("engine", ["hybrid", pytest.param("surrogate", marks=pytest.mark.slow)])
 def test_a_sequence_is_given_what_was_learned_between_two_frames(
     small_quickstart: Path, clouds: list[np.ndarray], engine: str, tmp_path: Path
 ) -> None:
