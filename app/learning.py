@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
+import signal
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -304,6 +305,7 @@ def _check(twin: Twin) -> None:
 def _learn(pipe: Connection, weights: bytes, card: dict[str, Any], body: Body, seconds: float, seed: int) -> None:
     import torch
 
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the twin, which ends this process
     with suppress(AttributeError, OSError):  # not on every system
         os.nice(_NICENESS)
     torch.set_num_threads(1)

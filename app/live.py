@@ -174,17 +174,19 @@ def watch_source(
         say_coordinates(twin, say)
         twin.registrar()  # prepared before the first cloud is waited for
         with _learning(twin, learn, say) as learner, opened(source, scene, twin, idle, say) as feed:
-            rows = register_live(
-                twin, feed.box, output, camera=camera, formats=formats or WRITTEN, budget=budget,
-                frame_landmarks=frame_landmarks, reply=feed.reply, learner=learner, say=say,
-            )  # fmt: skip
+            try:
+                rows = register_live(
+                    twin, feed.box, output, camera=camera, formats=formats or WRITTEN, budget=budget,
+                    frame_landmarks=frame_landmarks, reply=feed.reply, learner=learner, say=say,
+                )  # fmt: skip
+            finally:  # a watch ends by Ctrl-C as a rule
+                if learner is not None:
+                    say(str(learner))
+                    if keep:
+                        _keep(learner, scene.home.folder, say)
             say(keeping_up(rows))
             if told := feed.summary():
                 say(told)
-            if learner is not None:
-                say(str(learner))
-            if keep and learner is not None:
-                _keep(learner, scene.home.folder, say)
     return counts(rows)
 
 

@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 _DUE, _TELLING = 8, 4  # states since the last adaptation that make one worth while; states kept back before the first
 _BETTER = 0.9  # of the error on what was kept back, or the surrogate stays as it is
 _RATE = 0.3  # of the logarithm of a bound, by which a miss raises it: nine in ten hits lower it by as much
+_TINY = 1e-12  # metres: of a frame at rest nothing is wrong, and nothing was said
 _LEAST_SPREAD = 1e-3  # of the largest, of a coordinate that is new
 
 
@@ -236,7 +237,7 @@ class OnlineLearner:
             for name in ERRORS:
                 errors = np.array([apart.mean() if name == "mean" else apart.max() for apart in missed])
                 said = np.array([getattr(estimator.read(indicators), name) for indicators in shown])
-                factors[name] = max(1.0, quantile(errors / said, confidence) or 1.0)
+                factors[name] = max(1.0, quantile(errors / np.maximum(said, _TINY), confidence) or 1.0)
             estimator = estimator.scaled(factors)
         self._estimator = estimator
         return surrogate.with_card(certificate=estimator.known)

@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 pytest.importorskip("torch", reason="torch is absent")
 
-from softtwin.app import learning
+from softtwin.app import learning, live
 from softtwin.app.config import ConfigError
 from softtwin.app.learning import AS_BUILT, BackgroundLearner
 from softtwin.app.quickstart import CAMERA
@@ -128,6 +128,24 @@ def test_the_end_of_the_other_process_ends_learning_and_nothing_else(
         until(lambda: bool(lines), lambda: time.sleep(0.05))
         assert lines == ["learning has ended by itself; the twin goes on as it is"]
         assert sequence.register(clouds[0]).judgement.is_usable and not learner.keep(small_quickstart / "twin")
+
+
+def test_ctrl_c_keeps_what_was_learned(small_quickstart: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other process is sent it, too, and goes on until the twin ends it."""
+    kept: list[bool] = []
+
+    def interrupted(*_: object, learner: BackgroundLearner, **__: object) -> None:
+        until(lambda: learner._is_ready, lambda: time.sleep(0.05))
+        os.kill(learner._process.pid or 0, signal.SIGINT)
+        time.sleep(0.5)
+        kept.append(learner._process.is_alive())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(live, "register_live", interrupted)
+    monkeypatch.setattr(live, "_keep", lambda learner, folder, say: kept.append(folder == small_quickstart / "twin"))
+    with pytest.raises(KeyboardInterrupt):
+        live.watch_source(small_quickstart / "twin", tmp_path, tmp_path / "found", {}, learn=True, keep=True)
+    assert kept == [True, True]
 
 
 def test_twins_that_cannot_learn_say_why(small_quickstart: Path, monkeypatch: pytest.MonkeyPatch) -> None:
