@@ -151,6 +151,10 @@ class GaussNewton:
         """The same from the state of a frame before: closest points and scales stay the same over so short a way."""
         return replace(self, trusted=max(self.trusted, ACCURACY.trusted), is_near=True)
 
+    def directly(self) -> GaussNewton:
+        """The same with the last loss alone: where no part of the organ would be mistaken for outliers."""
+        return replace(self, losses=self.losses[-1:])
+
     def without_steps(self) -> GaussNewton:
         """The same, which takes any start for the end: to judge it."""
         return replace(self, losses=self.losses[:1], settled=1e9, handed_on=1e9, graduation=0.0)

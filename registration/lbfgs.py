@@ -69,6 +69,10 @@ class LBFGS:
         """The same: every closest point is searched anew in any case."""
         return self
 
+    def directly(self) -> LBFGS:
+        """The same with the last loss alone."""
+        return replace(self, losses=self.losses[-1:])
+
     def without_steps(self) -> LBFGS:
         """The same with one short run: to judge a start."""
         return replace(self, losses=self.losses[:1], max_iterations=1)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import bdtrc
 
 from ..cloud import Cloud
 from ..evaluation import Evaluation
-from ..loss import robust_deviation
+from ..loss import REJECTED, robust_deviation
 from ..policy import ACCURACY, POLICY
+from ..problem import Problem
 from ..result import Registration
 from ..setup import Ended, Setup
 from .cold_start import Localised, finish, from_rest
@@ -28,6 +30,8 @@ def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
         begun = from_rest(setup, points, prepared, setup.options.solver)
         return finish(setup, points, Localised(prepared, begun))
     solver = setup.options.solver.following()
+    if _is_as_expected(setup, problem, near, last):
+        solver = solver.directly()
     return Ended(prepared, solver.solve(problem, near.coefficients, near, last.eta))
 
 
@@ -44,3 +48,22 @@ def _is_nearer_at_rest(setup: Setup, near: Evaluation, last: Registration) -> bo
     few = near.cloud[:: max(1, len(near.cloud) // ACCURACY.glance)]
     rest = setup.observed.match(np.zeros_like(near.positions), few)
     return robust_deviation(rest.distances) < far
+
+
+def _is_as_expected(setup: Setup, problem: Problem, near: Evaluation, last: Registration) -> bool:
+    """True where the last state takes no more points of a cloud for outliers than it took of its own.
+
+    Then the convex loss, which keeps a part of the organ that has moved far from being mistaken for outliers, has
+    nothing to do. The number of outliers is held against the binomial law of the share that there was.
+
+    Args:
+        setup: what is registered.
+        problem: of the cloud.
+        near: the last state with the cloud.
+        last: the frame before.
+    """
+    deviations = np.hypot(last.noise, last.discrepancy_scale * problem.local_error(near))
+    weights = setup.options.solver.losses[-1].weight(problem.residuals(near, last.noise) / deviations)
+    count, known = int((weights < REJECTED).sum()), last.solved.is_kept
+    share = (np.sum(~known) + 0.5) / (len(known) + 1.0)  # of none that there were nothing is sure (Jeffreys)
+    return count == 0 or float(bdtrc(count - 1, len(weights), share)) > POLICY.unlikely

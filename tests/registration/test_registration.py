@@ -180,6 +180,31 @@ def test_sequences_start_warm_and_refuse_bad_clouds(body: Body, rng) -> None:
         list(register_sequence(registrar(body), [clouds[0] + 1.0]))
 
 
+@pytest.mark.parametrize(("shift", "losses"), [(0.0, 1), (0.02, 2)], ids=["as before", "a part has moved far"])
+def test_the_convex_loss_is_for_clouds_that_are_met_worse_than_the_last(
+    body: Body, rng, shift: float, losses: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Points in the same place as before need none; a part of them far off could be mistaken for outliers."""
+    made, model = registrar(body), Cantilever(body)
+    first, second = (model.solve(tip_forces(body, (0.0, 0.0, f))).displacement for f in (-0.8, -0.81))
+    last = made.register(cloud_on(body, first, 300, rng, 5e-4))
+    cloud = cloud_on(body, second, 300, rng, 5e-4)
+    cloud[cloud[:, 0] > 0.6, 2] -= shift
+    taken: list[int] = []
+    solve = GaussNewton.solve
+
+    def counted(solver: GaussNewton, *given: object) -> object:
+        taken.append(len(solver.losses))
+        return solve(solver, *given)
+
+    monkeypatch.setattr(GaussNewton, "solve", counted)
+    found = made.track(cloud, last)
+    assert taken == [losses]
+    assert found.outcome is Outcome.CONVERGED
+    if not shift:
+        assert np.abs(found.displacement - second).max() < 1e-3
+
+
 def test_a_tool_that_lets_go_is_no_way_back(body: Body, rng) -> None:
     """A cloud of the body at rest after a large movement: from rest, with no step."""
     made = registrar(body)
