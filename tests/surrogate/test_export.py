@@ -34,6 +34,7 @@ KINDS: dict[str, Architecture] = {
     "umesh": UMesh(channels=4, levels=2),
     "transolver": Transolver(width=8, depth=1, heads=2, slices=4),
 }
+_DEAR = ("umesh", "transolver")
 CLOSE = 1e-6  # of the largest: single precision
 
 
@@ -45,7 +46,10 @@ def untrained(kind: str, data: DataSet) -> Surrogate:
     return Surrogate(data.body, objective.encoder_decoder(), objective.trained(), {"architecture": kind})
 
 
-@pytest.fixture(scope="module", params=KINDS)
+# Each graph takes a quarter of a minute to be traced: two architectures before a release alone.
+@pytest.fixture(
+    scope="module", params=[pytest.param(kind, marks=[pytest.mark.slow] * (kind in _DEAR)) for kind in KINDS]
+)
 def pair(request: pytest.FixtureRequest, data: DataSet, tmp_path_factory) -> tuple[Surrogate, Path]:
     surrogate = untrained(request.param, data)
     return surrogate, export(surrogate, tmp_path_factory.mktemp("export") / "graphs", directions=7)
