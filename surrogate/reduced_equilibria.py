@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg.lapack import dpotrf, dpotrs
 from torch import Tensor
 
 from softtwin.reference.data.materials import MATERIALS, Material
@@ -33,6 +35,27 @@ _FAST = 0.1  # by which out-of-balance forces are to fall in a step, or the tang
 _SHIFTS = tuple(1e-3 * 4.0**i for i in range(14))  # of the stiffness at rest, added to a tangent that is indefinite
 _LEAST_JACOBIAN = 0.1  # in any cell of a state that cells are chosen by
 _EPSILONS = 8.0  # of machine precision, by which sums that cancel are off
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """What a search for a state reads again and again, as NumPy's arrays: see `GalerkinNetwork`.
+
+    Args:
+        flat: slopes, (9p, r).
+        slopes: (p, 9, r), and `turned`, (r, 9p), in single precision.
+        turned: see slopes.
+        weights: (p,).
+        support: (r, r).
+        parameters: of the law, by name, (p,) or (1,).
+    """
+
+    flat: Floats
+    slopes: NDArray[np.float32]
+    turned: NDArray[np.float32]
+    weights: Floats
+    support: Floats
+    parameters: SimpleNamespace
 
 
 class GalerkinNetwork(Network):
@@ -80,7 +103,8 @@ class GalerkinNetwork(Network):
         for name, values in parameters.items():
             self.register_buffer(f"{_PARAMETER}{name}", values)
         self.is_exact = True
-        self.register_buffer("at_rest", self.stiffness(torch.zeros_like(slopes[0, 0])))
+        at_rest = self.stiffness(np.zeros(slopes.shape[2]))
+        self.register_buffer("at_rest", torch.from_numpy(at_rest))
         if int(torch.linalg.cholesky_ex(self.at_rest)[1]):
             raise ValueError(
                 f"GalerkinNetwork: expected cells that hold all of {slopes.shape[2]} modes, got {len(slopes)} points, "
@@ -126,7 +150,8 @@ class GalerkinNetwork(Network):
         type(self._law)(**{**self._law.parameters, **values})  # refuses what no tissue has
         other = copy.copy(self)
         other._buffers = {**self._buffers, **found}
-        other.__dict__.pop("noise", None)
+        for name in ("noise", "_read"):
+            other.__dict__.pop(name, None)
         return other
 
     def _in_points(self, name: str, value: ArrayLike) -> Tensor:
@@ -184,7 +209,8 @@ class GalerkinNetwork(Network):
         """
         load = coordinates.to(self.slopes)
         start = near if isinstance(near, GalerkinState) and near.network.slopes is self.slopes else None
-        return GalerkinState(self, load, *_Search(self, load).found(start))
+        q, factor = _Search(self, load.numpy()).found(start)
+        return GalerkinState(self, load, torch.from_numpy(q), torch.from_numpy(factor))
 
     @staticmethod
     def from_state_dict(tensors: Mapping[str, Tensor]) -> GalerkinNetwork:
@@ -204,7 +230,9 @@ class GalerkinNetwork(Network):
         """
         while not self._law.is_linear and float(TorchAlgebra(q).det(self.gradients(q)).min()) < _LEAST_JACOBIAN:
             q = 0.8 * q
-        stress = self._density(self.gradients(q), 1).first * self.weights[:, None]
+        algebra, parameters = JetAlgebra(1), SimpleNamespace(**self.parameters_of_law)
+        stress = self._law.energy(algebra.variable(self.gradients(q)), None, parameters, algebra).first
+        stress = stress * self.weights[:, None]
         forces = torch.einsum("pir,pi->rp", self.slopes, stress)
         forces = torch.linalg.solve_triangular(self.rest_factor, forces, upper=False)
         found: Floats = (forces / torch.linalg.vector_norm(forces.sum(dim=1)).clamp_min(1e-300)).numpy()
@@ -218,8 +246,18 @@ class GalerkinNetwork(Network):
         return self.slopes.flatten(0, 1)
 
     @cached_property
-    def _single(self) -> tuple[Tensor, Tensor]:
-        return self.slopes.float(), self.flat.float().mT.contiguous()
+    def _read(self) -> _Cells:
+        flat = self.flat.numpy()
+        single = self.slopes.float().numpy()
+        parameters = {name: values.numpy() for name, values in self.parameters_of_law.items()}
+        return _Cells(
+            flat,
+            single,
+            np.ascontiguousarray(single.reshape(flat.shape).T),
+            self.weights.numpy(),
+            self.support.numpy(),
+            SimpleNamespace(**parameters),
+        )
 
     @cached_property
     def _law(self) -> Material:
@@ -234,8 +272,8 @@ class GalerkinNetwork(Network):
     @cached_property
     def noise(self) -> tuple[float, float]:
         """What rounding makes of energies, joules, and of forces, newtons: a density is rounded as its terms are."""
-        moduli = self._moduli(torch.zeros_like(self.at_rest[0]))
-        stiffest = _EPSILONS * torch.finfo(moduli.dtype).eps * float(moduli.abs().max())
+        moduli = self._moduli(np.zeros(len(self.at_rest)))
+        stiffest = _EPSILONS * float(np.finfo(np.float64).eps) * float(np.abs(moduli).max())
         size = torch.linalg.vector_norm(self.slopes * self.weights[:, None, None])
         return stiffest * float(self.weights.sum()), stiffest * float(size)
 
@@ -244,63 +282,85 @@ class GalerkinNetwork(Network):
         unit = torch.eye(3, dtype=q.dtype, device=q.device)
         return unit + (self.flat @ q).reshape(-1, 3, 3)
 
-    def energy_and_forces(self, q: Tensor) -> tuple[float, Tensor]:
-        """Stored energy, joules, infinite where a cell is inside out, and its derivative, (r,)."""
-        F, held = self.gradients(q), self.support @ q
-        if not self._law.is_linear and float(TorchAlgebra(F).det(F).min()) <= 0.0:
-            return float("inf"), held
-        density = self._density(F, 1)
-        energy = float(density.value @ self.weights + 0.5 * (held @ q))
-        return energy, self.flat.mT @ (density.first * self.weights[:, None]).reshape(-1) + held
+    def energy_and_forces(self, q: Floats) -> tuple[float, Floats]:
+        """Stored energy, joules, infinite where a cell is inside out, and its derivative, (r,).
 
-    def stiffness(self, q: Tensor, exact: bool = True) -> Tensor:
-        """Second derivative of the stored energy, (r, r), N/m; in single precision where six digits are enough."""
-        moduli = self._moduli(q) * self.weights[:, None, None]
-        size = self.slopes.shape[2]
+        Args:
+            q: coordinates of the displacement, (r,), metres.
+        """
+        read = self._read
+        held = read.support @ q
+        F, algebra = _gradients(read, q), JetAlgebra(1)
+        if not self._law.is_linear and not _determinants(F).min() > 0.0:
+            return np.inf, held
+        density = self._law.energy(algebra.variable(F), None, read.parameters, algebra)
+        energy = float(density.value @ read.weights + 0.5 * (held @ q))
+        return energy, (density.first * read.weights[:, None]).ravel() @ read.flat + held
+
+    def stiffness(self, q: Floats, exact: bool = True) -> Floats:
+        """Second derivative of the stored energy, (r, r), N/m; in single precision where six digits are enough.
+
+        Args:
+            q: coordinates of the displacement, (r,), metres.
+            exact: all digits.
+        """
+        read, size = self._read, len(q)
+        moduli = self._moduli(q) * read.weights[:, None, None]
         if exact:
-            return self.flat.mT @ torch.bmm(moduli, self.slopes).reshape(-1, size) + self.support
-        slopes, turned = self._single
-        return (turned @ torch.bmm(moduli.float(), slopes).reshape(-1, size)).to(q) + self.support
+            return read.flat.T @ np.matmul(moduli, read.flat.reshape(-1, 9, size)).reshape(-1, size) + read.support
+        bent = torch.bmm(torch.from_numpy(moduli.astype(np.float32)), torch.from_numpy(read.slopes)).numpy()
+        found: Floats = (read.turned @ bent.reshape(-1, size)).astype(np.float64) + read.support
+        return found
 
-    def _moduli(self, q: Tensor) -> Tensor:
+    def _moduli(self, q: Floats) -> Floats:
         """Second derivatives of the energy density by F, (p, 9, 9), pascals."""
-        second = self._density(self.gradients(q), 2).second
-        assert second is not None
-        return second.expand(len(self.slopes), 9, 9)
+        read, algebra = self._read, JetAlgebra(2)
+        second = self._law.energy(algebra.variable(_gradients(read, q)), None, read.parameters, algebra).second
+        return np.broadcast_to(second, (len(read.weights), 9, 9))
 
-    def _density(self, F: Tensor, order: int) -> Jet:
-        """Strain energy a cubic metre at deformation gradients, (p, 3, 3), with its derivatives."""
-        algebra, parameters = JetAlgebra(order), SimpleNamespace(**self.parameters_of_law)
-        density: Jet = self._law.energy(algebra.variable(F), None, parameters, algebra)
-        return density
+
+def _gradients(read: _Cells, q: Floats) -> Floats:
+    """F, (p, 3, 3)."""
+    return np.eye(3) + (read.flat @ q).reshape(-1, 3, 3)
+
+
+def _determinants(F: Floats) -> Floats:
+    """Of 3 x 3 matrices, (p,)."""
+    a, b, c, d, e, f, g, h, i = F.reshape(-1, 9).T
+    found: Floats = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+    return found
 
 
 class _Search:
     """Newton's method for the state of least potential energy under one load; tangents serve while they do well."""
 
-    def __init__(self, network: GalerkinNetwork, load: Tensor) -> None:
-        self.network, self.load = network, load
-        self.size = float(torch.linalg.vector_norm(load))
+    def __init__(self, network: GalerkinNetwork, load: Floats) -> None:
+        self.network, self.load, self.size = network, load, _norm(load)
         noise_of_energy, noise_of_forces = network.noise
         self.noise = noise_of_energy
         self.enough = max((_TOLERANCE if network.is_exact else _ROUGH) * self.size, noise_of_forces)
 
-    def _look(self, q: Tensor) -> tuple[float, Tensor]:
+    def _look(self, q: Floats) -> tuple[float, Floats]:
         stored, forces = self.network.energy_and_forces(q)
         return stored - float(self.load @ q), self.load - forces
 
-    def found(self, near: GalerkinState | None) -> tuple[Tensor, Tensor]:
+    def _begun(self, near: GalerkinState | None) -> tuple[Floats, Floats, bool, tuple[float, Floats]]:
+        """Coordinates to start from, a factor, whether it is the tangent's there, energy and out-of-balance forces."""
+        if near is not None:
+            factor = near.factor.numpy()
+            start = near.q.numpy() + _solved(factor, self.load - near.load.numpy())
+            there = self._look(start)
+            if there[0] < np.inf:
+                return start, factor, False, there
+        rest = np.zeros_like(self.load)
+        return rest, self.network.rest_factor.numpy(), True, self._look(rest)
+
+    def found(self, near: GalerkinState | None) -> tuple[Floats, Floats]:
         """Coordinates of the state, and the factor of its tangent, which is positive definite."""
         escapes = 0
-        q, factor, is_fresh = torch.zeros_like(self.load), self.network.rest_factor, True
-        energy, missing = self._look(q)
-        if near is not None:
-            start = near.q + torch.cholesky_solve((self.load - near.load)[:, None], near.factor)[:, 0]
-            there = self._look(start)
-            if there[0] < float("inf"):
-                q, factor, is_fresh, (energy, missing) = start, near.factor, False, there
+        q, factor, is_fresh, (energy, missing) = self._begun(near)
         for _ in range(_ITERATIONS):
-            left = float(torch.linalg.vector_norm(missing))
+            left = _norm(missing)
             if left <= self.enough:
                 factor, is_stable = self._factor(q)
                 if is_stable:
@@ -311,13 +371,13 @@ class _Search:
                 if escapes > _ESCAPES:
                     break
                 continue
-            step = torch.cholesky_solve(missing[:, None], factor)[:, 0]
+            step = _solved(factor, missing)
             length, there = self._length(q, step, energy, missing)
             if length:
                 q, (energy, missing) = q + length * step, there
             elif is_fresh:
                 break
-            is_slow = length < 1.0 or float(torch.linalg.vector_norm(missing)) > _FAST * left
+            is_slow = length < 1.0 or _norm(missing) > _FAST * left
             is_fresh = is_slow
             if is_slow:
                 factor, _ = self._factor(q)
@@ -326,10 +386,10 @@ class _Search:
             "the load's. The load may be too large: try a smaller one."
         )
 
-    def _off_the_saddle(self, q: Tensor, energy: float) -> tuple[Tensor, tuple[float, Tensor]]:
+    def _off_the_saddle(self, q: Floats, energy: float) -> tuple[Floats, tuple[float, Floats]]:
         """A state of less energy in the direction in which a balanced one gives way most."""
-        way = torch.linalg.eigh(self.network.stiffness(q)).eigenvectors[:, 0]
-        length = float(torch.linalg.vector_norm(q))
+        way = np.linalg.eigh(self.network.stiffness(q))[1][:, 0]
+        length = _norm(q)
         while length > self.noise:
             for sign in (1.0, -1.0):
                 there = self._look(q + sign * length * way)
@@ -338,29 +398,38 @@ class _Search:
             length *= 0.5
         return q, self._look(q)
 
-    def _length(self, q: Tensor, step: Tensor, energy: float, missing: Tensor) -> tuple[float, tuple[float, Tensor]]:
+    def _length(self, q: Floats, step: Floats, energy: float, missing: Floats) -> tuple[float, tuple[float, Floats]]:
         """Length of a step that lowers the energy, or leaves it and brings forces nearer to balance; 0 for none."""
-        slope, before, length = float(missing @ step), float(torch.linalg.vector_norm(missing)), 1.0
+        slope, before, length = float(missing @ step), _norm(missing), 1.0
         while length >= _SHORTEST:
             there = self._look(q + length * step)
             change = there[0] - energy
             if change <= -_DESCENT * length * slope:
                 return length, there
-            if abs(change) <= self.noise and float(torch.linalg.vector_norm(there[1])) < before:
+            if abs(change) <= self.noise and _norm(there[1]) < before:
                 return length, there
             length *= 0.5
         return 0.0, (energy, missing)
 
-    def _factor(self, q: Tensor) -> tuple[Tensor, bool]:
+    def _factor(self, q: Floats) -> tuple[Floats, bool]:
         """Of the tangent, or of a positive definite one beside it, and whether it is the tangent's own."""
         tangent = self.network.stiffness(q, self.network.is_exact)
-        factor, info = torch.linalg.cholesky_ex(tangent)
-        is_own = not int(info)
+        factor, info = dpotrf(tangent, lower=True)
+        is_own = not info
         for shift in _SHIFTS:
-            if not int(info):
+            if not info:
                 break
-            factor, info = torch.linalg.cholesky_ex(tangent + shift * self.network.at_rest)
+            factor, info = dpotrf(tangent + shift * self.network.at_rest.numpy(), lower=True)
         return factor, is_own
+
+
+def _norm(vector: Floats) -> float:
+    return float(np.sqrt(vector @ vector))
+
+
+def _solved(factor: Floats, right: Floats) -> Floats:
+    found: Floats = dpotrs(factor, right, lower=True)[0]
+    return found
 
 
 class GalerkinState:

@@ -75,6 +75,11 @@ def test_jets_are_what_autograd_makes_of_a_law(name: str, count: int, rng: np.ra
     )
     once = JetAlgebra(1)
     assert law.energy(once.variable(F), None, parameters, once).second is None
+    plain = SimpleNamespace(**{n: values.numpy() for n, values in vars(parameters).items()})
+    of_numpy = law.energy(algebra.variable(F.numpy()), None, plain, algebra)
+    for mine, theirs in ((of_numpy.value, found.value), (of_numpy.first, found.first), (of_numpy.second, found.second)):
+        assert isinstance(mine, np.ndarray)
+        np.testing.assert_allclose(mine, theirs.numpy(), rtol=1e-10, atol=1e-10 * float(theirs.abs().max()))
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -236,7 +241,7 @@ def test_a_bar_that_is_pressed_buckles() -> None:
         except NotConverged:
             continue
         found.append(push)
-        stiffness = network.stiffness(state.q)
+        stiffness = torch.from_numpy(network.stiffness(state.q.numpy()))
         assert float(torch.linalg.eigvalsh(stiffness).min()) > 0.0
         assert (float(state.q.reshape(-1, 3)[:, 1:].abs().max()) > 0.1) == (push > 0.15)
         unit = torch.eye(len(stiffness), dtype=torch.float64)
