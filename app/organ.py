@@ -132,10 +132,10 @@ def make_organ(section: BodySection, root: Path, springs: Mapping[str, str] = Ma
     body = body.with_sets(**zones)
     for name in springs:
         nodes = _nodes(body, f"springs.where.{name}", regions[f"springs.{name}"], section, reader)
-        body = replace(body, surfaces={**body.surfaces, name: _covered(body, f"springs.where.{name}", nodes)})
+        body = body.with_surfaces(**{name: _covered(body, f"springs.where.{name}", nodes)})
     if regions["observed"]:
         observed, said = _observed(body, regions["observed"], reader)
-        body, notes = replace(body, surfaces={**body.surfaces, "observed": observed}), [*notes, *said]
+        body, notes = body.with_surfaces(observed=observed), [*notes, *said]
     if section.grid > 0.0:
         if springs:
             raise ConfigError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -274,11 +274,30 @@ class Body:
 
     def with_sets(self, **sets: ArrayLike) -> Body:
         """The same body with more named node sets (a name that is there already is replaced)."""
-        return replace(self, node_sets={**self.node_sets, **{k: np.asarray(v) for k, v in sets.items()}})
+        checked = {name: _checked_set(name, np.asarray(nodes), len(self.points)) for name, nodes in sets.items()}
+        other = self._alike(node_sets=MappingProxyType({**self.node_sets, **checked}))
+        for name in ("free", "fingerprint"):
+            other.__dict__.pop(name, None)
+        if "fixed" in sets:
+            other._check_fixed()
+        return other
+
+    def with_surfaces(self, **surfaces: ArrayLike) -> Body:
+        """The same body with more named parts of its surface (a name that is there already is replaced)."""
+        vertices = self.points if self.skin is None else self.skin.points
+        checked = {name: _checked_facets(name, np.asarray(part), vertices) for name, part in surfaces.items()}
+        return self._alike(surfaces=MappingProxyType({**self.surfaces, **checked}))
 
     def with_inner(self, **surfaces: Surface) -> Body:
         """The same body with more embedded inner surfaces."""
-        return replace(self, inner={**self.inner, **surfaces})
+        return self._alike(inner=MappingProxyType({**self.inner, **surfaces}))
+
+    def _alike(self, **changes: Any) -> Body:
+        """The same cells with other names, which are checked already: what is known of the cells is not found anew."""
+        other = object.__new__(Body)
+        other.__dict__.update(self.__dict__)
+        other.__dict__.update(changes)
+        return other
 
     def quadratic(self) -> Body:
         """The same body with quadratic cells: the nodes that are there keep their numbers, further ones follow.

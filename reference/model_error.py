@@ -38,6 +38,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _LEAST_HELD = 3  # nodes: on fewer the body may turn
 _TOO_FAR = 3.0  # times the largest displacement of the model's own state: another branch, or nothing holds the organ
+_TOLERANCE = 1e-6  # of the forces: errors are right to a millionth of the movement
 _BLOCK = 4  # draws that are solved and written together
 _FINENESS, _FEWEST_NODES = 2.0, 60  # nodes of the finest other mesh, over the model's; of the coarsest
 
@@ -216,12 +217,13 @@ def _difference(
         forces[body.fixed] = 0.0
     if ensemble.poisson_ratio is not None:
         plan = replace(plan, poisson_ratio=float(rng.uniform(*ensemble.poisson_ratio)))
-    guess = None  # the model's own state is near: it halves the time, and the equilibrium is the same to 1e-10
+    guess = None  # the model's own state is near: it halves the time
     if carrier is None:
         guess = known.copy()
         guess[body.fixed] = 0.0
     try:
-        with Problem(body, plan.build_material(), plan.newton, springs=plan.springs) as problem:
+        newton = replace(plan.newton, tolerance=max(plan.newton.tolerance, _TOLERANCE))
+        with Problem(body, plan.build_material(), newton, springs=plan.springs) as problem:
             found = problem.solve(forces, guess, stability=False).displacement
     except NotConverged:
         return None
@@ -238,13 +240,13 @@ def _supported(data: DataSet, translation: Floats, body: Body) -> Body | None:
         if len(held) < _LEAST_HELD:
             return None
         body = body.with_sets(fixed=held)
-    surfaces = dict(body.surfaces)
+    surfaces = {}
     for name in on_surfaces(data.springs).keys() - {"boundary"}:
         nodes = shifted(model, translation, body, np.unique(model.surfaces[name]))
         surfaces[name] = body.boundary[np.isin(body.boundary, nodes).all(axis=1)]
         if not len(surfaces[name]):
             return None
-    return replace(body, surfaces=surfaces)
+    return body.with_surfaces(**surfaces) if surfaces else body
 
 
 def _is_supported_alike(body: Body, other: Body, springs: Iterable[str]) -> bool:
