@@ -9,7 +9,8 @@ Gammerman and Vovk 2008; Mondrian: Vovk, Gammerman and Shafer 2005). Draws that 
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -89,9 +90,11 @@ def calibrate(
             "of size make the bound one to go by."
         )
     _compare_loads(surrogate, data, split)
-    reader = IndicatorReader(surrogate)
-    shown, errors = read_samples(reader, data, held)
-    shown_before, errors_before = read_samples(reader, data, fitted)
+    reader, is_stepped = IndicatorReader(surrogate), len(np.unique(paths[:stepped])) >= needed(confidence)
+    newton = stepped if is_stepped else 0
+    stepping, errors = read_samples(reader, data, held, newton)
+    stepping_before, errors_before = read_samples(reader, data, fitted, newton)
+    shown, shown_before = _without_steps(stepping), _without_steps(stepping_before)
     entry = {
         "confidence": confidence,
         "split": split,
@@ -103,10 +106,8 @@ def calibrate(
     }
     if shown[0].load is not None:
         entry["limits"]["load"] = _usual_load(shown_before, shown, confidence)
-    if len(np.unique(paths[:stepped])) >= needed(confidence):
-        before, after = (
-            read_samples(reader, data, _first(samples, stepped), newton=True) for samples in (fitted, held)
-        )
+    if is_stepped:
+        before, after = _first(stepping_before, errors_before, stepped), _first(stepping, errors, stepped)
         entry["newton"] = fitted_bounds(before, after, paths[:stepped], confidence)
     return surrogate.with_card(certificate=entry)
 
@@ -146,24 +147,29 @@ def fitted_bounds(before: Seen, seen: Seen, paths: Ints, confidence: float) -> d
     }
 
 
-def _first(samples: Samples, count: int) -> Samples:
-    return Samples(**{field.name: getattr(samples, field.name)[:count] for field in fields(samples)})
+def _without_steps(shown: Sequence[ErrorIndicators]) -> list[ErrorIndicators]:
+    return [replace(each, newton=None) for each in shown]
 
 
-def read_samples(reader: IndicatorReader, data: DataSet, samples: Samples, newton: bool = False) -> Seen:
+def _first(shown: Sequence[ErrorIndicators], errors: Mapping[str, Floats], count: int) -> Seen:
+    """Of the first samples alone."""
+    return list(shown[:count]), {name: values[:count] for name, values in errors.items()}
+
+
+def read_samples(reader: IndicatorReader, data: DataSet, samples: Samples, newton: int = 0) -> Seen:
     """Signs of the predictions of samples, and their true errors, metres, (s,) each.
 
     Args:
         reader: of the surrogate's predictions.
         data: the data set.
         samples: of it.
-        newton: with a step of Newton's method each.
+        newton: so many of them, the first, with a step of Newton's method each.
     """
     forces, shown, found = np.zeros_like(data.body.points), [], np.empty_like(samples.displacements)
     for i, load in enumerate(samples.forces):
         forces[data.response.loaded] = load
         state = reader.surrogate.solve(forces)
-        shown.append(reader.read(forces, state, newton))
+        shown.append(reader.read(forces, state, i < newton))
         found[i] = state.displacement
     distances = nodal_distances(found, samples.displacements)
     return shown, {"mean": distances.mean(axis=1), "largest": distances.max(axis=1)}
@@ -235,7 +241,8 @@ def coverage(
         DataSetError: the split is not complete.
     """
     estimator = ErrorEstimator(surrogate)
-    shown, errors = read_samples(estimator.reader, data, data.samples(split, limit), newton)
+    samples = data.samples(split, limit)
+    shown, errors = read_samples(estimator.reader, data, samples, len(samples) if newton else 0)
     given = [estimator.read(indicators) for indicators in shown]
     bounds = {error: np.array([getattr(each, error) for each in given]) for error in ERRORS}
     eta = np.array([indicators.step for indicators in shown])

@@ -442,8 +442,7 @@ class Tangent:
     @cached_property
     def _indefinite(self) -> dict[int, SuperLU]:
         """LU factors of the tangents that are not positive definite, by their number."""
-        places = (3 * self.solver._free[:, None].cpu().numpy() + np.arange(3)).ravel()
         return {
-            wrong: splu(self.solver.elastic.stiffness(self.displacement[wrong])[places][:, places].tocsc())
+            wrong: splu(self.solver.elastic.free_stiffness(self.displacement[wrong]))
             for wrong in torch.nonzero(~self.is_stable)[:, 0].tolist()
         }

@@ -157,12 +157,11 @@ class EquilibriaState:
         """Directions that lower the energy: 0 is stable; None where it is not, of a body too large to count them."""
         if bool(self._tangent.is_stable[0]):
             return 0
-        free = (3 * np.flatnonzero(self._solver.elastic.free[:, 0].cpu().numpy())[:, None] + np.arange(3)).ravel()
-        if len(free) > _COUNTED:
+        elastic = self._solver.elastic
+        if 3 * int(elastic.free.sum()) > _COUNTED:
             return None
         at = torch.from_numpy(self.displacement.copy()).to(self._solver.device, self._solver.dtype)
-        stiffness = self._solver.elastic.stiffness(at)[free][:, free].toarray()
-        return int((np.linalg.eigvalsh(stiffness) < 0.0).sum())
+        return int((np.linalg.eigvalsh(elastic.free_stiffness(at).toarray()) < 0.0).sum())
 
     def jvp(self, changes: ArrayLike) -> Floats:
         """Change of the displacement, (3n, k), for small changes of the forces, (3n, k).

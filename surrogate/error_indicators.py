@@ -147,8 +147,7 @@ class IndicatorReader:
 
         The diagonal is the pivot, so that the signs of U are those of D in L D L^T.
         """
-        own = np.flatnonzero(self._free)
-        tangent = self._elastic.stiffness(displacement)[own].tocsc()[:, own]
+        tangent = self._elastic.free_stiffness(displacement)
         options = {"SymmetricMode": True}
         return splu(tangent, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options), tangent
 

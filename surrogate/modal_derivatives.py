@@ -30,7 +30,7 @@ class FactoredTangent:
         self.elastic = elastic
         self._free: Ints = np.flatnonzero(np.repeat(elastic.free[:, 0].numpy() > 0.0, 3))
         state = np.zeros((elastic.nodes, 3)) if displacement is None else displacement
-        own = elastic.stiffness(torch.from_numpy(np.array(state)))[self._free][:, self._free].tocsc()
+        own = elastic.free_stiffness(torch.from_numpy(np.array(state)))
         self._factor = splu(own, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
 
     def inverse(self, columns: Floats) -> Floats:

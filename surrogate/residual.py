@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
-from scipy.sparse import coo_matrix, csr_matrix
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
 from torch import Tensor, nn
 
 from softtwin.meshes.body import Body
@@ -21,6 +22,8 @@ from softtwin.reference.data.springs import Support, cell_springs, on_surfaces
 from .algebra import TorchAlgebra
 from .jets import JetAlgebra
 from .ligaments import Ligaments
+
+Ints = NDArray[np.int64]
 
 
 class ElasticBody(nn.Module):
@@ -290,6 +293,29 @@ class ElasticBody(nn.Module):
         rows, columns = np.broadcast_arrays(unknowns[:, :, None], unknowns[:, None, :])
         size = 3 * self.nodes
         return coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size)).tocsr()
+
+    @cached_property
+    def _pattern(self) -> tuple[Ints, Ints, Ints]:
+        """Rows and starts of the columns of the free unknowns' tangent, and where each number of the cells' goes.
+
+        What belongs to a fixed node goes to one place behind all others.
+        """
+        is_free = np.repeat(self.free[:, 0].cpu().numpy() > 0.0, 3)
+        count = int(is_free.sum())
+        number = np.where(is_free, np.cumsum(is_free) - 1, -1)
+        unknowns = number[(3 * self.cells[:, :, None].cpu().numpy() + np.arange(3)).reshape(len(self.cells), -1)]
+        rows, columns = unknowns[:, :, None], unknowns[:, None, :]
+        keys = np.where((rows >= 0) & (columns >= 0), columns * count + rows, count * count)
+        known, place = np.unique(keys, return_inverse=True)
+        known = known[known < count * count]
+        return known % count, np.searchsorted(known, count * np.arange(count + 1)), place.ravel()
+
+    def free_stiffness(self, displacement: Tensor) -> csc_matrix:
+        """The tangent of the free unknowns at one state, (n, 3), metres, N/m: `stiffness` without the fixed nodes."""
+        rows, starts, place = self._pattern
+        blocks = self.cell_stiffnesses(displacement).detach().double().cpu().numpy()
+        values = np.bincount(place, blocks.ravel(), len(rows))[: len(rows)]
+        return csc_matrix((values, rows, starts), shape=(len(starts) - 1, len(starts) - 1))
 
     def residual(self, displacement: Tensor, forces: Tensor) -> Tensor:
         """Out-of-balance forces at the free nodes relative to the forces there, |R(u) - b| / |b|, (s,).

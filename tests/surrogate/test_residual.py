@@ -20,6 +20,7 @@ from softtwin.reference.data.materials import (
     NeoHookean,
     SaintVenantKirchhoff,
 )
+from softtwin.reference.data.springs import Springs
 from softtwin.surrogate.residual import ElasticBody
 
 from .conftest import DEVICES
@@ -213,3 +214,18 @@ def test_a_batch_of_the_wrong_shape_or_type_is_refused(field: Tensor, message: s
     for ask in (physics.residual, physics.potential):
         with pytest.raises(ValueError, match=rf"ElasticBody\.forces: {message}"):
             ask(rest, field)
+
+
+def test_the_tangent_of_the_free_unknowns_is_a_part_of_the_whole(rng: np.random.Generator) -> None:
+    """In any state, with springs and with another stiffness of them."""
+    made = beam((4, 2, 2), (0.4, 0.1, 0.1), "tetrahedron")
+    side = made.boundary[np.isclose(made.points[made.boundary][..., 2], made.points[:, 2].max()).all(axis=1)]
+    body = Body(made.points, made.cells, made.node_sets, {"side": side})
+    elastic = ElasticBody(body, NeoHookean(4500.0, 0.4), springs={"side": Springs(2e4, 1e4)})
+    free = np.setdiff1d(np.arange(3 * len(body.points)), (3 * body.fixed[:, None] + np.arange(3)).ravel())
+    for each in (elastic, elastic.with_springs({"side": 3.0})):
+        for size in (0.0, 1e-3):
+            at = torch.from_numpy(size * rng.standard_normal(body.points.shape))
+            wanted = each.stiffness(at).toarray()[np.ix_(free, free)]
+            found = each.free_stiffness(at).toarray()
+            np.testing.assert_allclose(found, wanted, atol=1e-12 * np.abs(wanted).max())
