@@ -11,32 +11,33 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-_BATCH = 4  # cells that are taken at a time
+Singles = NDArray[np.float32]
+_BATCH = 8  # cells that are taken at a time
 _RIDGE = 1e-13  # of the mean square of a column, for columns that are nearly alike
 
 
-def sparse_weights(shares: Floats, tolerance: float, maximum: int) -> tuple[Ints, Floats, float]:
+def sparse_weights(shares: Floats | Singles, tolerance: float, maximum: int) -> tuple[Ints, Floats, float]:
     """Cells with weights that are not negative, whose weighted shares make the sum of all.
 
     Args:
-        shares: of each cell in each figure that is to be kept, (f, cells).
+        shares: of each cell in each figure that is to be kept, (f, cells); single precision is enough.
         tolerance: of what is missing, relative to the sum, in the Euclidean norm.
-        maximum: number of cells, but for the last few.
+        maximum: number of cells.
 
     Returns:
         Numbers of the cells, (c,), their weights, (c,), and what is missing, relative to the sum.
     """
-    wanted = shares.sum(axis=1)
+    wanted = shares.sum(axis=1, dtype=np.float64)
     size = float(np.linalg.norm(wanted))
     active: list[int] = []
     weights = np.zeros(0)
     products = np.zeros((0, 0))
-    right = shares.T @ wanted
+    right = _products(shares, wanted)
     missing = wanted.copy()
     while np.linalg.norm(missing) > tolerance * size and len(active) < maximum:
-        promise = shares.T @ missing
+        promise = _products(shares, missing)
         promise[active] = -np.inf
-        new = np.argsort(promise)[::-1][:_BATCH]
+        new = np.argsort(promise)[::-1][: min(_BATCH, maximum - len(active))]
         new = new[promise[new] > 0.0]
         if not len(new):
             break
@@ -44,15 +45,25 @@ def sparse_weights(shares: Floats, tolerance: float, maximum: int) -> tuple[Ints
         active += new.tolist()
         weights = np.concatenate([weights, np.zeros(len(new))])
         active, weights, products = _least_squares(active, weights, products, right)
-        before, missing = float(np.linalg.norm(missing)), wanted - shares[:, active] @ weights
+        before, missing = float(np.linalg.norm(missing)), wanted - _columns(shares, active) @ weights
         if np.linalg.norm(missing) >= before:  # rounding leaves no more to gain
             break
     return np.array(active, dtype=np.int64), weights, float(np.linalg.norm(missing)) / max(size, 1e-300)
 
 
-def _grown(products: Floats, shares: Floats, active: list[int], new: Ints) -> Floats:
+def _products(shares: Floats | Singles, vector: Floats) -> Floats:
+    """With every column, in the precision of the columns."""
+    return (shares.T @ vector.astype(shares.dtype)).astype(np.float64)
+
+
+def _columns(shares: Floats | Singles, places: list[int] | Ints) -> Floats:
+    return shares[:, places].astype(np.float64)
+
+
+def _grown(products: Floats, shares: Floats | Singles, active: list[int], new: Ints) -> Floats:
     """Scalar products of the columns that are taken, with new ones."""
-    mixed, own = shares[:, active].T @ shares[:, new], shares[:, new].T @ shares[:, new]
+    added = _columns(shares, new)
+    mixed, own = _columns(shares, active).T @ added, added.T @ added
     return np.block([[products, mixed], [mixed.T, own]])
 
 

@@ -28,6 +28,7 @@ from .warping import Warping
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Singles = NDArray[np.float32]
 _VARIED = {"poisson-ratio": "poisson_ratio", "young-modulus": "young_modulus"}
 _MODES_MORE, _DERIVATIVES_MORE, _CELLS_MORE = 5, 6, 60  # for each tissue beside the expected one
 _NOTHING = 1e-8  # of fields, that what they have outside of a basis is more than
@@ -35,7 +36,7 @@ _INSIDE = 0.3  # of a whole body's forces, that those of a structure count as
 _LOADS = 128  # typical loads, that nothing is solved for but linear responses
 _LEAST_SHARE = 0.2  # of the usual top, that the smallest of them are
 _STATES = 48  # of typical loads, that the cells are chosen by
-_SKETCH = 5000  # combinations of what the cells are chosen by (count sketch: Charikar, Chen, Farach-Colton 2004)
+_SKETCH = 2500  # combinations of what the cells are chosen by (count sketch: Charikar, Chen, Farach-Colton 2004)
 _OWN, _TANGENTS = 32, 24  # equilibria, at most, that the basis is told of, and whose tangents
 # Adapting while it is used: modes that are pushed, at so many states; modes and cells then.
 _PUSHED, _PUSHED_AT, _NEW_MODES, _NEW_CELLS, _NEW_TOLERANCE = 16, 4, 36, 600, 0.001
@@ -247,7 +248,7 @@ class Galerkin:
             law, parameters, slopes, weights, support_of(elastic, basis), cells, len(elastic.volumes)
         )
 
-        def parts() -> Iterator[Floats]:
+        def parts() -> Iterator[Singles]:
             for state in states[0]:
                 yield whole.shares(torch.from_numpy(state @ basis))
             for each, fields in zip(variations, states[1:], strict=True):
@@ -370,7 +371,7 @@ def _spread(data: DataSet, forces: Floats) -> Floats:
     return whole.reshape(len(forces), -1)
 
 
-def _sketched(parts: Iterable[Floats], size: int) -> Floats:
+def _sketched(parts: Iterable[Singles], size: int) -> Singles:
     """Rows of all parts, or fewer signed sums of them that have the same scalar products in the mean.
 
     Args:
@@ -378,9 +379,9 @@ def _sketched(parts: Iterable[Floats], size: int) -> Floats:
         size: r.
     """
     rng, groups = np.random.default_rng(0), max(1, _SKETCH // size)
-    sums: list[Floats] = []
+    sums: list[Singles] = []
     for number, part in enumerate(parts):
-        signed = rng.choice([-1.0, 1.0], size=(size, 1)) * part
+        signed = rng.choice([-1.0, 1.0], size=(size, 1)).astype(np.float32) * part
         if number < groups:
             sums.append(signed)
         else:

@@ -220,7 +220,7 @@ class GalerkinNetwork(Network):
         slopes, weights, support, cells = (tensors[name] for name in ("slopes", "weights", "support", "cells"))
         return GalerkinNetwork(law, parameters, slopes, weights, support, cells, int(tensors["cell_count"]))
 
-    def shares(self, q: Tensor) -> Floats:
+    def shares(self, q: Tensor) -> NDArray[np.float32]:
         """Of each cell in the forces along the modes, (r, p), in the energy norm at rest, as shares of a force of one.
 
         Where a cell of the state is nearly inside out, it is that of a smaller one.
@@ -228,15 +228,24 @@ class GalerkinNetwork(Network):
         Args:
             q: coordinates of the displacement, (r,), metres.
         """
-        while not self._law.is_linear and float(TorchAlgebra(q).det(self.gradients(q)).min()) < _LEAST_JACOBIAN:
+        F = self.gradients(q)
+        while not self._law.is_linear and float(TorchAlgebra(F).det(F).min()) < _LEAST_JACOBIAN:
             q = 0.8 * q
+            F = self.gradients(q)
         algebra, parameters = JetAlgebra(1), SimpleNamespace(**self.parameters_of_law)
-        stress = self._law.energy(algebra.variable(self.gradients(q)), None, parameters, algebra).first
-        stress = stress * self.weights[:, None]
-        forces = torch.einsum("pir,pi->rp", self.slopes, stress)
-        forces = torch.linalg.solve_triangular(self.rest_factor, forces, upper=False)
-        found: Floats = (forces / torch.linalg.vector_norm(forces.sum(dim=1)).clamp_min(1e-300)).numpy()
+        stress = self._law.energy(algebra.variable(F), None, parameters, algebra).first
+        stress = (stress * self.weights[:, None]).float()
+        forces = (self._turned @ stress[:, :, None])[:, :, 0].mT
+        size = torch.linalg.vector_norm(forces.sum(dim=1, dtype=torch.float64)).clamp_min(1e-300)
+        found: NDArray[np.float32] = (forces / size).contiguous().numpy()
         return found
+
+    @cached_property
+    def _turned(self) -> Tensor:
+        """Slopes in coordinates whose stiffness at rest is one, (p, r, 9), in single precision."""
+        size = self.slopes.shape[2]
+        flat = torch.linalg.solve_triangular(self.rest_factor, self.flat.mT, upper=False)
+        return flat.reshape(size, -1, 9).transpose(0, 1).float().contiguous()
 
     # ------------------------------------------------------------------ energy, forces, stiffness
 
