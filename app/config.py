@@ -334,8 +334,9 @@ class TrainingSection(Section):
     )
     vary: dict[str, tuple[float, float]] = option(
         {},
-        "least and largest value of what is not known of the tissue (poisson-ratio, young-modulus@STRUCTURE), which "
-        "the surrogate is then to know; galerkin alone: { poisson-ratio = [0.4, 0.49] }",
+        "least and largest value of what is not known of the tissue (poisson-ratio, young-modulus@STRUCTURE), and of "
+        "how many times as stiff as said springs are (springs@SURFACE), which the surrogate is then to know; galerkin "
+        "alone: { poisson-ratio = [0.4, 0.49] }",
     )
 
     @model_validator(mode="after")
@@ -550,8 +551,8 @@ class RegistrationSection(Section):
         models = ["surrogate", "reference", "hybrid", "torch"]
         if "contact" in kinds:
             models.remove("hybrid")
-        if any(each.kind not in ("young-modulus", "poisson-ratio") for each in others):
-            models.remove("surrogate")  # it has one support
+        if any(each.kind not in ("young-modulus", "poisson-ratio", "springs") for each in others):
+            models.remove("surrogate")  # it has one support, but for how stiff springs are
         if self.known_forces:  # they are added to those that the network is asked for, where both engines know of them
             models = [model for model in models if model != "surrogate"]
         of_gravity = {"weight", "gravity"} & set(kinds)
@@ -646,6 +647,10 @@ class Config(Section):
             raise ValueError(
                 f"registration.parameters: expected springs@ one of {self.springs.names}, got {strange[0]!r}"
             )
+        held = sorted(self.springs.where)
+        unheld = [name for name in self.training.vary if name.startswith("springs@") and name[8:] not in held]
+        if unheld:
+            raise ValueError(f"training.vary: expected springs@ one of {held}, got {unheld[0]!r}")
         return self
 
     @model_validator(mode="after")

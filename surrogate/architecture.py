@@ -69,6 +69,22 @@ class Network(nn.Module):
             "the galerkin architecture takes them, and so do --model reference, torch and hybrid."
         )
 
+    def with_springs(self, factors: Mapping[str, float]) -> Network:
+        """The same on springs that are stiffer or softer than its own.
+
+        Args:
+            factors: how many times as stiff, by the surface that they hold; others stay.
+
+        Raises:
+            ValueError: it has learned one support.
+        """
+        if all(factor == 1.0 for factor in factors.values()):
+            return self
+        raise ValueError(
+            f"{type(self).__name__}: expected the springs that it has learned, got other ones of {sorted(factors)}; "
+            "the galerkin architecture takes them, and so do --model reference, torch and hybrid."
+        )
+
     def stiffening(self, values: Mapping[str, ArrayLike]) -> float:
         """How many times as stiff as its own a tissue is, where that scales loads alone: 1 if it has learned one."""
         return 1.0

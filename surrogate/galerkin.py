@@ -15,7 +15,7 @@ from softtwin.meshes.body import Body
 from softtwin.reference.data.dataset import DataSet, Samples, stored_plans
 from softtwin.reference.data.materials import MATERIALS, Material, with_parameters
 from softtwin.reference.data.samplers import LoadPlan, draw_load, draw_smooth_load
-from softtwin.reference.data.springs import ligaments_of
+from softtwin.reference.data.springs import ligaments_of, on_surfaces
 
 from .architecture import NewSamples
 from .cubature import sparse_weights
@@ -30,6 +30,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Singles = NDArray[np.float32]
 _VARIED = {"poisson-ratio": "poisson_ratio", "young-modulus": "young_modulus"}
+_SPRINGS = "springs"
 _MODES_MORE, _DERIVATIVES_MORE, _CELLS_MORE = 5, 6, 60  # for each tissue beside the expected one
 _NOTHING = 1e-8  # of fields, that what they have outside of a basis is more than
 _INSIDE = 0.3  # of a whole body's forces, that those of a structure count as
@@ -45,17 +46,23 @@ _CHANGES, _SEEN = 6, 64  # changes of each state that modes are told of; newest 
 
 @dataclass(frozen=True, eq=False)
 class Variation:
-    """A tissue that the model is to know beside the one that is expected.
+    """A tissue, or a support, that the model is to know beside the one that is expected.
 
     Args:
         material: the law with its parameters.
         parameters: those that differ, one for each cell of the body.
         cells: numbers of the cells where they do; None for all.
+        springs: how many times as stiff as expected springs are, by the surface that they hold; others as expected.
     """
 
     material: Material
-    parameters: Mapping[str, Floats]
-    cells: Ints | None
+    parameters: Mapping[str, Floats] = field(default_factory=dict)
+    cells: Ints | None = None
+    springs: Mapping[str, float] = field(default_factory=dict)
+
+    def of(self, elastic: ElasticBody) -> ElasticBody:
+        """A body with it."""
+        return elastic.with_material(self.material).with_springs(self.springs)
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,8 @@ class Galerkin:
         cells: that stand for the body, about.
         tolerance: of internal forces by these cells, relative, below which no more are taken.
         vary: least and largest value of what is not known of the tissue, by name: `poisson-ratio`, `young-modulus`, or
-            `young-modulus@STRUCTURE` of what lies in a closed inner surface. States may be asked for with any of it.
+            `young-modulus@STRUCTURE` of what lies in a closed inner surface; of `springs@SURFACE`, how many times as
+            stiff they may be. States may be asked for with any of it.
 
     Raises:
         ValueError: an argument out of its range.
@@ -98,9 +106,11 @@ class Galerkin:
             raise ValueError(f"Galerkin.tolerance: expected a number between 0 and 1, got {self.tolerance}.")
         for name, ends in self.vary.items():
             kind, _, place = name.partition("@")
-            if kind not in _VARIED or (place and kind != "young-modulus"):
+            takes_place = kind in ("young-modulus", _SPRINGS)
+            if kind not in (*_VARIED, _SPRINGS) or (place and not takes_place) or (kind == _SPRINGS and not place):
                 raise ValueError(
-                    f"Galerkin.vary: expected {', '.join(_VARIED)} or young-modulus@STRUCTURE, got {name!r}."
+                    f"Galerkin.vary: expected {', '.join(_VARIED)}, young-modulus@STRUCTURE or springs@SURFACE, got "
+                    f"{name!r}."
                 )
             if len(ends) != 2 or not 0.0 < ends[0] < ends[1] < np.inf:
                 raise ValueError(f"Galerkin.vary: expected two growing positive numbers for {name}, got {list(ends)}.")
@@ -114,7 +124,8 @@ class Galerkin:
             ValueError: a plane body, or no such structure.
         """
         for name in self.vary:
-            varied(name, body)
+            if not is_of_springs(name):
+                varied(name, body)
         if body.dimension != 3:
             raise ValueError(f"Galerkin.body: expected a body in space, got one of {body.dimension} dimensions.")
 
@@ -135,9 +146,9 @@ class Galerkin:
                 f"Galerkin.data: expected springs on surfaces alone, got the ligaments {cords}; "
                 "learn a network (architecture reduced), or register with --model torch or reference."
             )
-        variations = self.variations(data.body, data.material)
+        variations = self.variations(data.body, data.material, sorted(on_surfaces(data.springs)))
         elastic = ElasticBody(data.body, data.material, springs=data.springs)
-        bodies = [elastic, *(elastic.with_material(each.material) for each in variations)]
+        bodies = [elastic, *(each.of(elastic) for each in variations)]
         loads = _spread(data, typical_loads(data, train))
         tangents = [FactoredTangent(body) for body in bodies]
         linear = [tangent.inverse(loads.T).T for tangent in tangents]
@@ -152,18 +163,23 @@ class Galerkin:
         encode = np.ascontiguousarray(at_loaded.T)
         return LinearEncoderDecoder(data.response.loaded, np.zeros(len(left)), left, right, encode, basis), network
 
-    def variations(self, body: Body, material: Material) -> list[Variation]:
-        """The tissue at either end of each range.
+    def variations(self, body: Body, material: Material, springs: Sequence[str] = ()) -> list[Variation]:
+        """The tissue, or the support, at either end of each range.
 
         Args:
             body: that has the structures which `vary` names.
             material: the tissue as it is expected.
+            springs: the surfaces that springs hold.
 
         Raises:
-            ValueError: no such structure, a range that the law refuses, or that does not hold what is expected.
+            ValueError: no such structure, no such springs, a range that the law refuses, or that does not hold what is
+                expected.
         """
         found = []
         for name, ends in self.vary.items():
+            if is_of_springs(name):
+                found += _on_other_springs(name, ends, material, springs)
+                continue
             parameter, cells = varied(name, body)
             expected = np.broadcast_to(np.asarray(material.parameters[parameter], dtype=np.float64), len(body.cells))
             here = expected if cells is None else expected[cells]
@@ -252,7 +268,7 @@ class Galerkin:
             for state in states[0]:
                 yield whole.shares(torch.from_numpy(state @ basis))
             for each, fields in zip(variations, states[1:], strict=True):
-                changed = whole.with_parameters(each.parameters)
+                changed = whole.with_parameters(each.parameters).with_springs(each.springs)
                 for state in fields:
                     share = changed.shares(torch.from_numpy(state @ basis))
                     yield share
@@ -268,7 +284,7 @@ class Galerkin:
             {name: values[chosen] for name, values in parameters.items()},
             slopes[chosen],
             weights[chosen] * torch.from_numpy(factors),
-            whole.support,
+            support_of(elastic, basis),
             cells[chosen],
             len(elastic.volumes),
         )
@@ -310,6 +326,24 @@ class Galerkin:
     def from_state_dict(tensors: Mapping[str, Tensor]) -> GalerkinNetwork:
         """The network from what its `state_dict` was."""
         return GalerkinNetwork.from_state_dict(tensors)
+
+
+def is_of_springs(name: str) -> bool:
+    """Whether a name of `vary` is of springs."""
+    return name.partition("@")[0] == _SPRINGS
+
+
+def _on_other_springs(
+    name: str, ends: tuple[float, float], material: Material, springs: Sequence[str]
+) -> list[Variation]:
+    place = name.partition("@")[2]
+    if place not in springs:
+        raise ValueError(f"Galerkin.vary: expected springs@ one of {list(springs)}, got {name!r}.")
+    if not ends[0] <= 1.0 <= ends[1]:
+        raise ValueError(
+            f"Galerkin.vary: expected a range of {name} that holds 1, as stiff as they are, got {list(ends)}."
+        )
+    return [Variation(material, springs={place: end}) for end in ends]
 
 
 def varied(name: str, body: Body) -> tuple[str, Ints | None]:
@@ -405,13 +439,13 @@ def slopes_of(elastic: ElasticBody, basis: Floats) -> Tensor:
     return torch.einsum("ckir,cqkj->cqijr", nodal, elastic.gradients).reshape(-1, 9, size)
 
 
-def support_of(elastic: ElasticBody, basis: Floats) -> Tensor:
-    """Stiffness of the springs between modes, (r, r), N/m."""
-    size = basis.shape[1]
-    if not len(elastic.sprung):
-        return torch.zeros(size, size, dtype=torch.float64)
-    nodal = torch.from_numpy(basis.reshape(-1, 3, size))[elastic.cells[elastic.sprung]].flatten(1, 2)
-    return torch.einsum("cir,cij,cjs->rs", nodal, elastic.spring_stiffness, nodal)
+def support_of(elastic: ElasticBody, basis: Floats) -> dict[str, Tensor]:
+    """Stiffness of the springs between modes, (r, r), N/m, as they were given, by the surface that they hold."""
+    nodal = torch.from_numpy(basis.reshape(-1, 3, basis.shape[1]))[elastic.cells[elastic.sprung]].flatten(1, 2)
+    return {
+        name: torch.einsum("cir,cij,cjs->rs", nodal, part, nodal)
+        for name, part in zip(elastic.springs, elastic.spring_parts, strict=True)
+    }
 
 
 def _warped(elastic: ElasticBody, linear: Floats, size: float) -> Floats:

@@ -21,7 +21,7 @@ from softtwin.reference.data.springs import Support, springs_of
 
 from .architecture import Linearisation, Network
 from .encoder_decoder import LinearEncoderDecoder
-from .galerkin import varied
+from .galerkin import is_of_springs, varied
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -39,6 +39,7 @@ class SurrogateState:
         network: for another tissue than the surrogate's own, where there is one.
         tissue: parameters of that, by name; empty for the surrogate's own.
         stiffening: how many times as stiff as its own it is: coordinates and linear part are of the load over it.
+        springs: how many times as stiff as its own springs are, by the surface that they hold.
     """
 
     negative_pivots: int | None = None  # a network has no tangent to count them of
@@ -52,8 +53,10 @@ class SurrogateState:
         network: Network | None = None,
         tissue: Mapping[str, ArrayLike] = MappingProxyType({}),
         stiffening: float = 1.0,
+        springs: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         encoder_decoder = surrogate.encoder_decoder
+        self.springs = springs
         self._surrogate, self.coordinates, self.tissue, self._stiffening = surrogate, coordinates, tissue, stiffening
         self._linear = linear
         self.inner = (network or surrogate.network).linearised(torch.from_numpy(coordinates), near)
@@ -91,6 +94,11 @@ class SurrogateState:
         """How far out the tissue lies, 1 at the ends of the ranges that the surrogate was made for."""
         worst = 0.0
         for name, (low, high) in self._surrogate.card.get("plan", {}).get("vary", {}).items():
+            if is_of_springs(name):
+                factor = self.springs.get(name.partition("@")[2], 1.0)
+                far = np.log(max(factor, 1e-300) ** 2 / (low * high)) / np.log(high / low)
+                worst = max(worst, abs(float(far)))
+                continue
             parameter, cells = self._surrogate.varied(name)
             if parameter in self.tissue:
                 values = np.asarray(self.tissue[parameter], dtype=np.float64)
@@ -118,32 +126,32 @@ class SurrogateState:
         """Change of the displacement, (3n, k), for k changes of forces and parameters of the tissue.
 
         Raises:
-            ValueError: prescribed displacements or springs that change, which a surrogate has learned one of;
-                parameters that the law does not have.
+            ValueError: prescribed displacements that change, which a surrogate has learned one of; parameters that the
+                law does not have, springs that there are not.
         """
         found = np.zeros((self.displacement.size, len(changes)))
         for place, change in enumerate(changes):
-            if change.displacement is not None or change.springs:
+            if change.displacement is not None:
                 raise ValueError(
-                    "SurrogateState.jvp_inputs: expected forces and parameters of the tissue, got displacements or "
-                    "springs; the reference knows them (--model reference)."
+                    "SurrogateState.jvp_inputs: expected forces, parameters of the tissue and springs, got "
+                    "displacements; the reference knows them (--model reference)."
                 )
             if change.forces is not None:
                 forces = np.asarray(change.forces, dtype=np.float64).reshape(-1, 1)
                 found[:, place] += self.jvp(forces)[:, 0]
-            if change.parameters:
-                found[:, place] += self._by_tissue(change.parameters)
+            if change.parameters or change.springs:
+                found[:, place] += self._by_tissue(change.parameters, change.springs)
         return found
 
-    def _by_tissue(self, changes: Mapping[str, ArrayLike]) -> Floats:
-        """Change of the displacement, (3n,), as parameters of the tissue change.
+    def _by_tissue(self, changes: Mapping[str, ArrayLike], springs: Mapping[str, float]) -> Floats:
+        """Change of the displacement, (3n,), as parameters of the tissue and springs change.
 
         What all cells share of a change of Young's modulus is one of the load: u(b, E) = u(b / s, E / s).
         """
         surrogate = self._surrogate
         if not surrogate.takes_inputs:
             raise ValueError(
-                "SurrogateState.jvp_inputs: expected forces, got parameters of the one tissue that is known."
+                "SurrogateState.jvp_inputs: expected forces, got parameters of the one tissue that is known or springs."
             )
         rates, shared = dict(changes), 0.0
         if "young_modulus" in rates and surrogate.network.stiffening({"young_modulus": 1.0}) != 1.0:
@@ -152,7 +160,7 @@ class SurrogateState:
             modulus, rate = np.broadcast_arrays(modulus, rate)
             shared = float((rate / modulus).mean())
             rates["young_modulus"] = (rate - shared * modulus) / self._stiffening
-        values = self.inner.jvp_parameters(rates).numpy()  # type: ignore[attr-defined]
+        values = self.inner.jvp_parameters(rates, springs).numpy()  # type: ignore[attr-defined]
         encoder_decoder = surrogate.encoder_decoder
         by_load = self._linear + encoder_decoder.decoded(tangent(self.inner, self.coordinates[:, None])[:, 0])
         return np.asarray(encoder_decoder.decoded(values) - shared * by_load)
@@ -254,7 +262,7 @@ class Surrogate:
         Args:
             forces: nodal forces, (n, 3), newtons.
             near: a state of this surrogate under a load nearby; networks that look for their values begin there.
-            inputs: another tissue, for networks that take one, and more forces.
+            inputs: another tissue and springs, for networks that take them, and more forces.
 
         Raises:
             ValueError: another shape, numbers that are not finite, or forces at nodes that the surrogate never saw
@@ -263,10 +271,11 @@ class Surrogate:
         load = checked_array("Surrogate.forces", forces, self.body.points.shape)
         network, stiffening = self.network, 1.0
         tissue: dict[str, ArrayLike] = {}
+        springs = {} if inputs is None else dict(inputs.springs)
         if inputs is not None:
-            if inputs.displacement or any(factor != 1.0 for factor in inputs.springs.values()):
+            if inputs.displacement:
                 raise ValueError(
-                    "Surrogate.inputs: expected a tissue and forces, got displacements or springs, of which it has "
+                    "Surrogate.inputs: expected a tissue, springs and forces, got displacements, of which it has "
                     "learned one; the reference knows others (--model reference)."
                 )
             if inputs.forces is not None:
@@ -278,11 +287,13 @@ class Surrogate:
                     {"young_modulus": np.asarray(tissue["young_modulus"]) / stiffening} if stiffening != 1.0 else {}
                 )
                 network = network.with_parameters({**tissue, **modulus})
+            if springs:
+                network = network.with_springs(springs)
         self._refuse_idle("forces", np.abs(load).max(axis=1))
         loads = load.ravel()[self.rows] / stiffening
         start = near.inner if isinstance(near, SurrogateState) and near._surrogate is self else None
         encoded, linear = self.encoder_decoder.encoded(loads), self.encoder_decoder.linear(loads)
-        return SurrogateState(self, encoded, linear, start, network, tissue, stiffening)
+        return SurrogateState(self, encoded, linear, start, network, tissue, stiffening, springs)
 
     def varied(self, name: str) -> tuple[str, Ints | None]:
         """The parameter that a name of `vary` stands for, and the cells where it is meant; looked up once."""

@@ -66,7 +66,7 @@ class GalerkinNetwork(Network):
         parameters: of the law, by name, one for each cell that is taken, (p,), or one for all, (1,).
         slopes: gradients of the modes in the cells that are taken, (p, 9, r), 1/m.
         weights: volume that each of them stands for, (p,), m^3.
-        support: stiffness of what holds the body and gives way, between modes, (r, r), N/m.
+        support: stiffness of springs that hold the body, between modes, (r, r), N/m, by the surface that they hold.
         cells: number of the body's cell that each of them lies in, (p,).
         cell_count: of the body.
 
@@ -77,7 +77,9 @@ class GalerkinNetwork(Network):
     is_graph = False
     slopes: Tensor
     weights: Tensor
-    support: Tensor
+    spring_names: Tensor
+    spring_parts: Tensor
+    spring_factors: Tensor
     law: Tensor
     cells: Tensor
     cell_count: Tensor
@@ -89,14 +91,18 @@ class GalerkinNetwork(Network):
         parameters: Mapping[str, Tensor],
         slopes: Tensor,
         weights: Tensor,
-        support: Tensor,
+        support: Mapping[str, Tensor],
         cells: Tensor,
         cell_count: int,
     ) -> None:
         super().__init__()
         self.register_buffer("slopes", slopes.contiguous())
         self.register_buffer("weights", weights)
-        self.register_buffer("support", support)
+        size = slopes.shape[2]
+        parts = [part.to(slopes) for part in support.values()]
+        self.register_buffer("spring_names", torch.tensor(list("\n".join(support).encode()), dtype=torch.uint8))
+        self.register_buffer("spring_parts", torch.stack(parts) if parts else slopes.new_zeros(0, size, size))
+        self.register_buffer("spring_factors", slopes.new_ones(len(parts)))
         self.register_buffer("cells", cells)
         self.register_buffer("cell_count", torch.tensor(cell_count))
         self.register_buffer("law", torch.tensor(list(law.encode()), dtype=torch.uint8))
@@ -116,6 +122,16 @@ class GalerkinNetwork(Network):
         """By name, (p,) or (1,)."""
         return {n.removeprefix(_PARAMETER): values for n, values in self.named_buffers() if n.startswith(_PARAMETER)}
 
+    @property
+    def springs(self) -> tuple[str, ...]:
+        """The surfaces that springs hold."""
+        return tuple(bytes(self.spring_names.tolist()).decode().split("\n")) if len(self.spring_parts) else ()
+
+    @property
+    def support(self) -> Tensor:
+        """Stiffness of all springs, (r, r), N/m."""
+        return torch.einsum("n,nij->ij", self.spring_factors, self.spring_parts)
+
     def stiffening(self, values: Mapping[str, ArrayLike]) -> float:
         """How many times as stiff as its own a tissue is, in the geometric mean over cells: what scales loads alone.
 
@@ -124,7 +140,7 @@ class GalerkinNetwork(Network):
         Args:
             values: as for `with_parameters`.
         """
-        if "young_modulus" not in values or bool(self.support.any()):
+        if "young_modulus" not in values or bool(self.spring_parts.any()):
             return 1.0
         given, own = np.asarray(values["young_modulus"], dtype=np.float64), self.parameters_of_law["young_modulus"]
         if not (given > 0.0).all() or bool((own != own[0]).any()):
@@ -150,9 +166,38 @@ class GalerkinNetwork(Network):
         type(self._law)(**{**self._law.parameters, **values})  # refuses what no tissue has
         other = copy.copy(self)
         other._buffers = {**self._buffers, **found}
+        return other._forgetful()
+
+    def with_springs(self, factors: Mapping[str, float]) -> GalerkinNetwork:
+        """The same on springs that are stiffer or softer than its own; what is corrected stays the response on those.
+
+        Args:
+            factors: how many times as stiff, by the surface that they hold; others as they were.
+
+        Raises:
+            ValueError: no springs there, or a factor that is negative.
+        """
+        self._check_springs(factors)
+        wrong = {name: factor for name, factor in factors.items() if not 0.0 <= factor < np.inf}
+        if wrong:
+            raise ValueError(f"GalerkinNetwork.with_springs: expected factors of at least 0, got {wrong}.")
+        other = copy.copy(self)
+        given = [factors.get(name, float(own)) for name, own in zip(self.springs, self.spring_factors, strict=True)]
+        other._buffers = {**self._buffers, "spring_factors": torch.tensor(given, dtype=torch.float64).to(self.slopes)}
+        return other._forgetful()
+
+    def _check_springs(self, values: Mapping[str, float]) -> None:
+        strange = sorted(values.keys() - set(self.springs))
+        if strange:
+            raise ValueError(
+                f"GalerkinNetwork.springs: expected names among {sorted(self.springs)}, got {strange[0]!r}."
+            )
+
+    def _forgetful(self) -> GalerkinNetwork:
+        """Itself, without what depends on parameters and springs."""
         for name in ("noise", "_read"):
-            other.__dict__.pop(name, None)
-        return other
+            self.__dict__.pop(name, None)
+        return self
 
     def _in_points(self, name: str, value: ArrayLike) -> Tensor:
         """A parameter, or its change, in the cells that are taken, (p,) or (1,)."""
@@ -189,6 +234,17 @@ class GalerkinNetwork(Network):
         pushed = torch.func.jvp(stress, (at,), (along,))[1]
         return self.flat.mT @ (pushed * self.weights[:, None]).reshape(-1)
 
+    def forces_by_springs(self, q: Tensor, changes: Mapping[str, float]) -> Tensor:
+        """Change of the forces along the modes, (r,), newtons, as springs become stiffer.
+
+        Args:
+            q: coordinates of the displacement, (r,), metres.
+            changes: of how many times as stiff they are, by the surface that they hold.
+        """
+        self._check_springs(changes)
+        rates = torch.tensor([changes.get(name, 0.0) for name in self.springs], dtype=torch.float64).to(self.slopes)
+        return torch.einsum("n,nij,j->i", rates, self.spring_parts, q)
+
     def forward(self, coordinates: Tensor) -> Tensor:
         """Corrections for coordinates of loads, one after the other.
 
@@ -217,7 +273,12 @@ class GalerkinNetwork(Network):
         """The network from what its `state_dict` was."""
         law = bytes(tensors["law"].tolist()).decode()
         parameters = {n.removeprefix(_PARAMETER): v for n, v in tensors.items() if n.startswith(_PARAMETER)}
-        slopes, weights, support, cells = (tensors[name] for name in ("slopes", "weights", "support", "cells"))
+        slopes, weights, cells = (tensors[name] for name in ("slopes", "weights", "cells"))
+        if "support" in tensors:  # of before springs had names
+            support = {"": tensors["support"]} if bool(tensors["support"].any()) else {}
+        else:
+            names = bytes(tensors["spring_names"].tolist()).decode().split("\n")
+            support = dict(zip(names, tensors["spring_parts"], strict=False))
         return GalerkinNetwork(law, parameters, slopes, weights, support, cells, int(tensors["cell_count"]))
 
     def shares(self, q: Tensor) -> NDArray[np.float32]:
@@ -464,7 +525,12 @@ class GalerkinState:
         """Gradient with respect to the coordinates, (r,), for one with respect to the values, (r,): symmetric."""
         return self.jvp(cotangent[:, None])[:, 0]
 
-    def jvp_parameters(self, changes: Mapping[str, ArrayLike]) -> Tensor:
-        """Change of the values, (r,), as parameters of the law change: see `GalerkinNetwork.forces_by_parameters`."""
-        forces = self.network.forces_by_parameters(self.q, changes)
+    def jvp_parameters(self, changes: Mapping[str, ArrayLike], springs: Mapping[str, float]) -> Tensor:
+        """Change of the values, (r,), as parameters of the law and springs change.
+
+        Args:
+            changes: see `GalerkinNetwork.forces_by_parameters`.
+            springs: see `GalerkinNetwork.forces_by_springs`.
+        """
+        forces = self.network.forces_by_parameters(self.q, changes) + self.network.forces_by_springs(self.q, springs)
         return -torch.cholesky_solve(forces[:, None], self.factor)[:, 0]

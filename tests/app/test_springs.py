@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from softtwin.app.chain import build_twin
 from softtwin.app.config import Config, ConfigError, parse_config, read_config, to_toml
 from softtwin.app.inputs import mesh_inputs
 from softtwin.app.report import report_stage
+from softtwin.app.stages.learn import train_stage
 from softtwin.app.stages.mesh import mesh_stage
 from softtwin.app.twin import Twin
 from softtwin.app.workspace import Workspace
@@ -23,9 +25,11 @@ from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.io import write_body
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.data.inputs import Inputs
 from softtwin.reference.data.materials import NeoHookean
 from softtwin.reference.data.springs import Ligament, Springs
 from softtwin.reference.solve.problem import Problem
+from softtwin.surrogate.model import Surrogate
 
 pytestmark = pytest.mark.fenicsx
 BED = Springs(normal=6e4, tangential=2e4)
@@ -178,6 +182,47 @@ def test_engines_agree_on_it_where_forces_are_unknown(built: Path) -> None:
         low, high = found.estimates[0].interval
     assert values["torch"] == pytest.approx(values["reference"], rel=1e-3)
     assert low < values["reference"] < high  # hybrid's, whose noise and force scale are those of the network's search
+
+
+@pytest.fixture(scope="module")
+def galerkin(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same equilibria, of which the Galerkin model makes a twin that knows a range of stiffness."""
+    folder = tmp_path_factory.mktemp("galerkin") / "out"
+    shutil.copytree(built, folder)
+    training = {"architecture": "galerkin", "vary": {"springs@bed": (0.3, 3.0)}}
+    train_stage(Workspace(config(training=training), folder), fresh=True)
+    (folder / "organ.toml").write_text(to_toml(config(training=training)))
+    (folder / "twin" / "organ.toml").write_text(to_toml(config(training=training)))
+    return folder
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_surrogate_may_know_their_stiffness_as_an_input(galerkin: Path, factor: float) -> None:
+    """States and registrations are those of torch, and far from those of the stiffness that is expected."""
+    forces, truth, cloud = on_other_springs(galerkin, factor, 0)
+    with Twin.open(galerkin / "twin") as twin:
+        assert isinstance(twin.network, Surrogate)
+        ways = [twin.network.solve(forces, inputs=Inputs(springs={"bed": each})) for each in (factor, 1.0, 4.0)]
+        assert ways[0].extrapolation_ratio <= ways[2].extrapolation_ratio and ways[2].extrapolation_ratio > 1.0
+    missed = [np.linalg.norm(way.displacement - truth) / np.linalg.norm(truth) for way in ways[:2]]
+    assert missed[0] < 0.1 * missed[1] and missed[1] > 0.3
+    values = {}
+    for model in ("surrogate", "torch"):
+        with Twin.open(galerkin / "twin", model, zone="tool", parameters=["springs@bed=1"]) as twin:
+            found = twin.register(cloud)
+        assert np.linalg.norm(found.displacement - truth, axis=1).mean() < 6e-4
+        values[model] = found.estimates[0]
+    assert values["surrogate"].name == "stiffness of the springs bed"
+    low, high = values["torch"].interval
+    assert low < values["surrogate"].value < high
+
+
+def test_a_stiffness_that_a_surrogate_does_not_know_is_said(built: Path) -> None:
+    with pytest.raises(ConfigError, match="expected reference or hybrid or torch with springs@bed"):
+        Twin.open(built / "twin", "surrogate", parameters=["springs@bed"])
+    training = {"architecture": "galerkin", "vary": {"springs@roof": (0.5, 2.0)}}
+    with pytest.raises(ValueError, match=r"training.vary: expected springs@ one of \['bed'\], got 'springs@roof'"):
+        config(training=training)
 
 
 def test_springs_that_are_not_there_cannot_be_found(built: Path) -> None:

@@ -197,6 +197,38 @@ def test_springs_hold_it_as_they_hold_the_body(rng: np.random.Generator) -> None
     assert np.abs(exact - without_them).max() > 0.1 * np.abs(exact).max()
 
 
+def test_springs_may_be_stiffer_or_softer(rng: np.random.Generator) -> None:
+    """States are those of the body on such springs; derivatives by the factor are those of differences."""
+    body = body_of("tetrahedron", 1)
+    face = body.boundary[(body.points[body.boundary][:, :, 0] > body.points[:, 0].max() - 1e-9).all(axis=1)]
+    body = replace(body, surfaces={**body.surfaces, "end": face})
+    loads = some_loads(body, 1, 8.0, rng)
+    network = whole_span(body, "Neo-Hookean", {"end": Springs(3e4, 1e4)})
+    free = np.setdiff1d(np.arange(len(body.points)), body.fixed)
+    load = loads[0, free].flatten()
+    for factor in (0.0, 0.4, 3.0):
+        other = {"end": Springs(3e4 * factor, 1e4 * factor)} if factor else {}
+        exact = Equilibria(body, LAWS["Neo-Hookean"], springs=other).solve(loads)
+        found = network.with_springs({"end": factor}).linearised(load).q.numpy()
+        truth = exact.displacement[0].numpy()[free].ravel()
+        np.testing.assert_allclose(found, truth, rtol=0.0, atol=1e-7 * np.abs(truth).max())
+    at = network.with_springs({"end": 0.7}).linearised(load)
+    ends = [network.with_springs({"end": 0.7 + sign * 1e-4}).linearised(load, at).q for sign in (1.0, -1.0)]
+    difference = (ends[0] - ends[1]) / 2e-4
+    pushed = at.jvp_parameters({}, {"end": 1.0})
+    torch.testing.assert_close(pushed, difference, rtol=0.0, atol=1e-5 * float(difference.abs().max()))
+    assert float(pushed.abs().max()) > 1e-3
+    again = GalerkinNetwork.from_state_dict(network.state_dict())
+    assert again.springs == ("end",)
+    torch.testing.assert_close(again.with_springs({"end": 0.7}).linearised(load).q, at.q)
+    former = dict(network.state_dict())
+    former["support"] = network.support
+    assert bool((GalerkinNetwork.from_state_dict(former).support == network.support).all())
+    for wrong, words in (({"side": 2.0}, r"expected names among \['end'\], got 'side'"), ({"end": -1.0}, "at least 0")):
+        with pytest.raises(ValueError, match=words):
+            network.with_springs(wrong)
+
+
 def test_derivatives_pass_the_taylor_test_and_are_symmetric(bar: Body, rng: np.random.Generator) -> None:
     network = whole_span(bar, "Neo-Hookean")
     load = some_loads(bar, 1, 12.0, rng)[0, np.setdiff1d(np.arange(len(bar.points)), bar.fixed)].flatten()
@@ -458,14 +490,20 @@ def test_a_tissue_that_it_cannot_be_is_refused(varied: tuple[DataSet, Surrogate]
             surrogate.solve(forces, inputs=Inputs(parameters=wrong_tissue))
     with pytest.raises(ValueError, match="finite"):
         surrogate.solve(forces, inputs=Inputs(forces=np.full_like(forces, np.nan)))
-    with pytest.raises(ValueError, match="displacements or springs"):
+    with pytest.raises(ValueError, match=r"expected names among \[\], got 'end'"):
         surrogate.solve(forces, inputs=Inputs(springs={"end": 2.0}))
-    with pytest.raises(ValueError, match="displacements or springs"):
+    with pytest.raises(ValueError, match=r"expected names among \[\], got 'end'"):
         surrogate.solve(forces).jvp_inputs([Change(springs={"end": 2.0})])
+    with pytest.raises(ValueError, match="got displacements"):
+        surrogate.solve(forces, inputs=Inputs(displacement={"end": np.zeros((1, 3))}))
+    with pytest.raises(ValueError, match="got displacements"):
+        surrogate.solve(forces).jvp_inputs([Change(displacement=forces)])
     network = train(data, TrainingPlan(Reduced(modes=4, width=8, depth=1), epochs=1))
     assert not network.takes_inputs and surrogate.takes_inputs
     with pytest.raises(ValueError, match="the galerkin architecture takes them"):
         network.solve(forces, inputs=Inputs(parameters={"poisson_ratio": 0.4}))
+    with pytest.raises(ValueError, match="expected the springs that it has learned"):
+        network.solve(forces, inputs=Inputs(springs={"end": 2.0}))
     with pytest.raises(ValueError, match="the one tissue that is known"):
         network.solve(forces).jvp_inputs([Change(parameters={"poisson_ratio": 0.01})])
     with pytest.raises(ValueError, match="expected an inner surface"):
@@ -473,8 +511,9 @@ def test_a_tissue_that_it_cannot_be_is_refused(varied: tuple[DataSet, Surrogate]
     with pytest.raises(ValueError, match="take more cells, or a smaller tolerance"):
         train(data, TrainingPlan(replace(SMALL, cells=1)))
     for wrong, words in (
-        ({"density": (1.0, 2.0)}, "expected poisson-ratio, young-modulus or"),
-        ({"poisson-ratio@lump": (0.4, 0.45)}, "expected poisson-ratio, young-modulus or"),
+        ({"density": (1.0, 2.0)}, "expected poisson-ratio, young-modulus, young"),
+        ({"poisson-ratio@lump": (0.4, 0.45)}, "expected poisson-ratio, young-modulus, young"),
+        ({"springs": (0.5, 2.0)}, r"springs@SURFACE, got 'springs'"),
         ({"poisson-ratio": (0.48, 0.4)}, "two growing positive numbers"),
         ({"poisson-ratio": (0.4, 0.6)}, "below 0.5"),
     ):
@@ -484,3 +523,5 @@ def test_a_tissue_that_it_cannot_be_is_refused(varied: tuple[DataSet, Surrogate]
         train(data, TrainingPlan(replace(SMALL, vary={"poisson-ratio": (0.3, 0.4)})))
     with pytest.raises(ValueError, match="expected an inner surface"):
         train(data, TrainingPlan(replace(SMALL, vary={"young-modulus@nothing": (1e3, 1e4)})))
+    with pytest.raises(ValueError, match=r"expected springs@ one of \[\], got 'springs@bed'"):
+        train(data, TrainingPlan(replace(SMALL, vary={"springs@bed": (0.5, 2.0)})))
