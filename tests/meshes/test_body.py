@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -148,3 +149,26 @@ def test_fractions_are_part_of_a_body(body: Body) -> None:
     for wrong in (0.0, 1.5, np.nan):
         with pytest.raises(BodyError, match=r"Body.fractions: expected numbers in \(0, 1\]"):
             replace(body, fractions=np.r_[wrong, filled[1:]])
+
+
+def test_a_body_with_other_names_is_the_same_body_and_checked() -> None:
+    """What is known of its cells is taken over; what depends on names is not."""
+    body = beam((4, 2, 2), (0.4, 0.1, 0.1), "tetrahedron")
+    known = body.boundary, body.boundary_nodes, body.free, body.fingerprint
+    tip = body.node_sets["tip"]
+    other = body.with_sets(fixed=tip, spot=tip[:2])
+    assert other.boundary is known[0] and other.boundary_nodes is known[1]
+    assert np.array_equal(other.free, np.setdiff1d(np.arange(len(body.points)), tip))
+    assert other.fingerprint == Body(body.points, body.cells, {"fixed": tip}).fingerprint != known[3]
+    assert np.array_equal(body.fixed, np.setdiff1d(np.arange(len(body.points)), known[2]))
+    named = other.with_surfaces(seen=body.boundary[:5])
+    assert np.array_equal(named.surfaces["seen"], body.boundary[:5]) and not other.surfaces
+    assert np.array_equal(named.fixed, tip) and named.fingerprint == other.fingerprint
+    again = pickle.loads(pickle.dumps(named))
+    assert again.fingerprint == named.fingerprint and set(again.node_sets) == {*body.node_sets, "spot"}
+    with pytest.raises(BodyError, match="at least 3 fixed nodes, got 2"):
+        body.with_sets(fixed=tip[:2])
+    with pytest.raises(BodyError, match="expected node numbers"):
+        body.with_sets(spot=[len(body.points)])
+    with pytest.raises(BodyError, match="surfaces"):
+        body.with_surfaces(seen=[[0, 1, len(body.points)]])
