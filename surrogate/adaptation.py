@@ -19,7 +19,7 @@ from softtwin.reference.data.outcome import NotConverged
 
 from .architecture import AdaptableArchitecture
 from .calibration import needed, quantile
-from .error_bound import ERRORS, ErrorBound, ErrorEstimator
+from .error_bound import ERRORS, ErrorEstimator
 from .error_indicators import Error, elastic_of
 from .exact_states import ExactStates
 from .model import Surrogate
@@ -28,7 +28,7 @@ from .registry import ARCHITECTURES
 Floats = NDArray[np.float64]
 _DUE, _TELLING = 8, 4  # states since the last adaptation that make one worth while; states kept back before the first
 _BETTER = 0.9  # of the error on what was kept back, or the surrogate stays as it is
-_RATE = 0.3  # of the logarithm of a bound, by which a miss raises it: nine in ten hits lower it by as much
+_RATE = 0.3  # of the logarithm of a bound, by which a miss raises it beside what it missed by; nine hits undo that
 _TINY = 1e-12  # metres: of a frame at rest nothing is wrong, and nothing was said
 _LEAST_SPREAD = 1e-3  # of the largest, of a coordinate that is new
 
@@ -160,7 +160,7 @@ class OnlineLearner:
             said = self._estimator.bound_error(load, state)
             bound = {"mean": said.mean, "largest": said.largest}
             self._estimator = self._estimator.scaled(
-                {name: _raised(error[name] > bound[name], said) for name in ERRORS}
+                {name: _raised(error[name], bound[name], said.confidence) for name in ERRORS}
             )
             self.current = self.current.with_card(certificate=self._estimator.known)
         return error, bound
@@ -219,14 +219,15 @@ class OnlineLearner:
     def _recalibrated(self, surrogate: Surrogate) -> Surrogate:
         """With bounds that hold on what was kept back, where that is enough to say so, and that are as wide as before.
 
-        What is kept back lies between what was learned, and frames to come do not: it may widen bounds, and only tests
-        narrow them. Their indicators tell by themselves that predictions are better in balance now.
+        Frames that are kept back lie between those that were learned, and frames to come do not; states ahead that are
+        kept back lie farther out. Both may widen bounds, and only tests narrow them. The indicators tell by themselves
+        that predictions are better in balance now.
         """
         if self._estimator is None:
             return surrogate
         estimator = self._estimator.of(surrogate)
         shown, missed = [], []
-        for each in self._exact.frames.kept_back:
+        for each in self._exact.kept_back:
             state = surrogate.solve(each.forces)
             shown.append(estimator.reader.read(each.forces, state))
             missed.append(nodal_distances(state.displacement[None], each.displacement[None])[0])
@@ -243,6 +244,7 @@ class OnlineLearner:
         return surrogate.with_card(certificate=estimator.known)
 
 
-def _raised(is_missed: bool, said: ErrorBound) -> float:
-    """What a bound is multiplied with after a test of it."""
-    return float(np.exp(_RATE * (float(is_missed) - (1.0 - said.confidence))))
+def _raised(error: float, bound: float, confidence: float) -> float:
+    """What a bound is multiplied with after a test of it: by what it missed an error by at once, as loads drift."""
+    missed = error / bound if error > bound > 0.0 else 1.0
+    return missed * float(np.exp(_RATE * (float(error > bound) - (1.0 - confidence))))
