@@ -7,7 +7,7 @@ the implicit function theorem. `galerkin` chooses modes and cells.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import SimpleNamespace
@@ -28,6 +28,7 @@ from .jets import Jet, JetAlgebra
 Floats = NDArray[np.float64]
 _PARAMETER = "parameter_"
 _TOLERANCE, _ROUGH = 1e-10, 1e-6  # out-of-balance forces relative to the load's, exact and rounded
+_DIFFERENCE = 1e-2  # of the linear response: a step of a central difference of the forces
 _ITERATIONS, _ESCAPES = 200, 3  # of Newton's method; from balanced states that are not stable
 _DESCENT = 1e-4  # of what the slope promises
 _SHORTEST = 1e-6
@@ -334,6 +335,11 @@ class GalerkinNetwork(Network):
         """The law, whatever its constants: those that count are the buffers'."""
         return MATERIALS[bytes(self.law.tolist()).decode()](1.0, 0.0)
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether forces are linear in the displacement."""
+        return self._law.is_linear
+
     @cached_property
     def rest_factor(self) -> Tensor:
         """Cholesky factor of the stiffness at rest."""
@@ -422,8 +428,22 @@ class _Search:
             there = self._look(start)
             if there[0] < np.inf:
                 return start, factor, False, there
-        rest = np.zeros_like(self.load)
-        return rest, self.network.rest_factor.numpy(), True, self._look(rest)
+        rest, factor = np.zeros_like(self.load), self.network.rest_factor.numpy()
+        at_rest = self._look(rest)
+        for start in self._expanded(factor):
+            there = self._look(start)
+            if there[0] < at_rest[0]:
+                return start, factor, False, there
+        return rest, factor, True, at_rest
+
+    def _expanded(self, factor: Floats) -> Iterator[Floats]:
+        """Where the expansion of the state to second order leads for the load, and for half of it."""
+        if self.network.is_linear:
+            return
+        first = _solved(factor, self.load)
+        ways = [self.network.energy_and_forces(sign * _DIFFERENCE * first)[1] for sign in (1.0, -1.0)]
+        second = _solved(factor, -0.5 * (ways[0] + ways[1]) / _DIFFERENCE**2)
+        yield from (share * first + share**2 * second for share in (1.0, 0.5))
 
     def found(self, near: GalerkinState | None) -> tuple[Floats, Floats]:
         """Coordinates of the state, and the factor of its tangent, which is positive definite."""

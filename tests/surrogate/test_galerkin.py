@@ -34,7 +34,7 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.physics import Physics
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
-from softtwin.surrogate.reduced_equilibria import GalerkinNetwork
+from softtwin.surrogate.reduced_equilibria import GalerkinNetwork, _Search
 from softtwin.surrogate.residual import ElasticBody
 from softtwin.surrogate.train import train
 from softtwin.surrogate.twin import load, save
@@ -250,6 +250,22 @@ def test_a_state_nearby_changes_the_way_and_not_the_end(bar: Body, rng: np.rando
         torch.testing.assert_close(network.linearised(load, near).values, cold, rtol=0.0, atol=1e-8)
     rounded = network.rounded().linearised(load).values
     assert 0.0 < float((rounded - cold).abs().max()) < 1e-5 * float(cold.abs().max())
+
+
+def test_from_rest_it_begins_where_the_second_order_leads(bar: Body, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same states, by fewer tangents."""
+    network, made = whole_span(bar, "Neo-Hookean"), []
+    free = np.setdiff1d(np.arange(len(bar.points)), bar.fixed)
+    stiffness = GalerkinNetwork.stiffness
+    monkeypatch.setattr(GalerkinNetwork, "stiffness", lambda *given: made.append(1) or stiffness(*given))
+    found = {}
+    for name, expanded in (("second", _Search._expanded), ("none", lambda self, factor: iter(()))):
+        monkeypatch.setattr(_Search, "_expanded", expanded)
+        made.clear()
+        loads = some_loads(bar, 4, 8.0, np.random.default_rng(3))
+        found[name] = torch.stack([network.linearised(load[free].flatten()).values for load in loads]), len(made)
+    torch.testing.assert_close(found["second"][0], found["none"][0], rtol=0.0, atol=1e-8)
+    assert found["second"][1] < found["none"][1]
 
 
 def test_at_rest_nothing_is_corrected(bar: Body) -> None:
