@@ -648,7 +648,8 @@ class Config(Section):
                 f"registration.parameters: expected springs@ one of {self.springs.names}, got {strange[0]!r}"
             )
         held = sorted(self.springs.where)
-        unheld = [name for name in self.training.vary if name.startswith("springs@") and name[8:] not in held]
+        places = {name: name.partition("@") for name in self.training.vary}
+        unheld = [name for name, (kind, _, place) in places.items() if kind == "springs" and place not in held]
         if unheld:
             raise ValueError(f"training.vary: expected springs@ one of {held}, got {unheld[0]!r}")
         return self

@@ -26,6 +26,22 @@ def median_seconds(call: Callable[[], Any], repeats: int) -> float:
     return float(np.median(seconds))
 
 
+def relative_errors(predictions: Iterable[tuple[Callable[[], Any], Any]]) -> dict[str, float]:
+    """|u - u*| / |u*| of predictions, per cent: median and 95 %, their number, and how long one takes, ms.
+
+    Args:
+        predictions: what gives a state, and its true displacement, (n, 3), metres.
+    """
+    missed, seconds = [], []
+    for predict, truth in predictions:
+        begin = time.perf_counter()
+        state = predict()
+        seconds.append(time.perf_counter() - begin)
+        missed.append(100.0 * float(np.linalg.norm(state.displacement - truth) / np.linalg.norm(truth)))
+    found = {"median": float(np.median(missed)), "p95": float(np.percentile(missed, 95)), "count": len(missed)}
+    return {**found, "ms": 1e3 * float(np.median(seconds))}
+
+
 def resident_mib(process: int | str = "self") -> float:
     """Memory that a process holds, MiB."""
     status = Path(f"/proc/{process}/status").read_text()

@@ -13,12 +13,14 @@ as it is, for the others.
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
 from columns import Column
 from harness import FOLDER, Benchmark, Given, Setting, run
 from numpy.typing import NDArray
+from summaries import relative_errors
 
 from softtwin.meshes.signed import cells_inside
 from softtwin.reference.data.dataset import DataSet
@@ -86,14 +88,13 @@ def work(row: str, given: Given) -> dict[str, Any]:
     }
     found: dict[str, Any] = {"seconds": seconds, "modes": len(surrogate.network.at_rest)}
     for name, cases in groups.items():
-        missed, spent = [], []
-        for tissue, forces, truth in cases:
-            clock = time.perf_counter()
-            state = surrogate.solve(forces, inputs=Inputs(parameters=tissue) if tissue and MODELS[row] else None)
-            spent.append(time.perf_counter() - clock)
-            missed.append(100.0 * float(np.linalg.norm(state.displacement - truth) / np.linalg.norm(truth)))
-        found[name] = {"median": float(np.median(missed)), "p95": float(np.percentile(missed, 95)), "count": len(cases)}
-        found[name]["ms"] = 1e3 * float(np.median(spent))
+        found[name] = relative_errors(
+            (
+                partial(surrogate.solve, forces, inputs=Inputs(parameters=tissue) if tissue and MODELS[row] else None),
+                truth,
+            )
+            for tissue, forces, truth in cases
+        )
     return found
 
 

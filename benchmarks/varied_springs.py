@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from columns import Column
 from harness import Benchmark, Given, Setting, run
 from numpy.typing import NDArray
 from record import RUNS
+from summaries import relative_errors
 
 from softtwin.meshes.shapes import liver_phantom
 from softtwin.reference.data.dataset import DataSet
@@ -79,14 +81,10 @@ def work(row: str, given: Given) -> dict[str, Any]:
         ("others", cases["others"], True),
         ("untold", cases["others"], False),
     ):
-        missed, spent = [], []
-        for factor, forces, truth in group:
-            clock = time.perf_counter()
-            state = surrogate.solve(forces, inputs=Inputs(springs={"bed": factor}) if is_told else None)
-            spent.append(time.perf_counter() - clock)
-            missed.append(100.0 * float(np.linalg.norm(state.displacement - truth) / np.linalg.norm(truth)))
-        found[name] = {"median": float(np.median(missed)), "p95": float(np.percentile(missed, 95)), "count": len(group)}
-        found[name]["ms"] = 1e3 * float(np.median(spent))
+        found[name] = relative_errors(
+            (partial(surrogate.solve, forces, inputs=Inputs(springs={"bed": factor}) if is_told else None), truth)
+            for factor, forces, truth in group
+        )
     return found
 
 

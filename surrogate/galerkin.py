@@ -114,6 +114,10 @@ class Galerkin:
                 )
             if len(ends) != 2 or not 0.0 < ends[0] < ends[1] < np.inf:
                 raise ValueError(f"Galerkin.vary: expected two growing positive numbers for {name}, got {list(ends)}.")
+            if kind == _SPRINGS and not ends[0] <= 1.0 <= ends[1]:
+                raise ValueError(
+                    f"Galerkin.vary: expected a range of {name} that holds 1, as stiff as they are, got {list(ends)}."
+                )
             if kind == "poisson-ratio" and ends[1] >= 0.5:
                 raise ValueError(f"Galerkin.vary: expected Poisson's ratios below 0.5, got {list(ends)}.")
 
@@ -339,10 +343,6 @@ def _on_other_springs(
     place = name.partition("@")[2]
     if place not in springs:
         raise ValueError(f"Galerkin.vary: expected springs@ one of {list(springs)}, got {name!r}.")
-    if not ends[0] <= 1.0 <= ends[1]:
-        raise ValueError(
-            f"Galerkin.vary: expected a range of {name} that holds 1, as stiff as they are, got {list(ends)}."
-        )
     return [Variation(material, springs={place: end}) for end in ends]
 
 

@@ -530,6 +530,7 @@ def test_a_tissue_that_it_cannot_be_is_refused(varied: tuple[DataSet, Surrogate]
         ({"density": (1.0, 2.0)}, "expected poisson-ratio, young-modulus, young"),
         ({"poisson-ratio@lump": (0.4, 0.45)}, "expected poisson-ratio, young-modulus, young"),
         ({"springs": (0.5, 2.0)}, r"springs@SURFACE, got 'springs'"),
+        ({"springs@bed": (1.5, 2.0)}, r"a range of springs@bed that holds 1, .* got \[1\.5, 2\.0\]"),
         ({"poisson-ratio": (0.48, 0.4)}, "two growing positive numbers"),
         ({"poisson-ratio": (0.4, 0.6)}, "below 0.5"),
     ):
