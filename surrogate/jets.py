@@ -2,7 +2,7 @@
 
 Each law stands once, in `reference.data.materials`; what carries derivatives along is the algebra that it is written in
 (second-order forward mode: Griewank and Walther 2008, chapter 13). A tenth of what autograd takes for a few hundred
-points; of so few, NumPy's arrays take a third of what torch's take, and are carried along as well.
+points; for so few, NumPy's arrays cost less than torch's, and are carried along as well.
 """
 
 from __future__ import annotations
