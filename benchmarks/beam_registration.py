@@ -155,18 +155,16 @@ class Clock:
 def watched(clock: Clock) -> Iterator[None]:
     """Take the times of all problems of registration meanwhile."""
     kept = {name: getattr(Search, name) for name in ("_state", "jacobian")}
-    matches = {name: getattr(SurfaceDistance, name) for name in ("match", "match_nearby", "match_beyond")}
+    match = SurfaceDistance.match
     try:
         Search._state = clock.timed("states", kept["_state"])
         Search.jacobian = clock.timed("derivatives", kept["jacobian"])
-        for name, run in matches.items():
-            setattr(SurfaceDistance, name, clock.timed("closest points", run))
+        SurfaceDistance.match = clock.timed("closest points", match)
         yield
     finally:
         for name, run in kept.items():
             setattr(Search, name, run)
-        for name, run in matches.items():
-            setattr(SurfaceDistance, name, run)
+        SurfaceDistance.match = match
 
 
 def stresses(elastic: ElasticBody, displacement: Floats) -> Floats:

@@ -249,9 +249,7 @@ def force(body: Body, count: int) -> dict[str, Any]:
                     ended = min(ended, again, key=lambda found: found.evaluation.match.rms)
                 for noise in (1e-5, 1e-6, 1e-7):  # a cloud without noise, believed more and more
                     search = replace(search, noise=LogNormalPrior(noise, 0.0, minimum=noise))
-                    ended = replace(SOLVER, settled=1e-2, trusted=3.0).solve(
-                        search, ended.evaluation.coefficients, ended.evaluation
-                    )
+                    ended = replace(SOLVER, settled=1e-2).solve(search, ended.evaluation.coefficients, ended.evaluation)
                     solved += ended.evaluations
             except NotConverged:
                 failed.append(number)

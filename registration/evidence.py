@@ -14,11 +14,12 @@ so that a block of unknowns tells its own scale, however that depends on eta, an
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dtrmv
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from scipy.optimize import minimize
 
@@ -59,9 +60,7 @@ class LinearProblem:
     @cached_property
     def upper(self) -> Floats:
         """B' W B of each group, (g, k k), for products with a symmetric matrix of which the upper triangle is known."""
-        count = self.projection.shape[1]
-        doubled = 2.0 * np.triu(np.ones((count, count))) - np.eye(count)
-        return (self.information * doubled).reshape(len(self.information), -1)
+        return (self.information * _doubled(self.projection.shape[1])).reshape(len(self.information), -1)
 
     def weighted(self, precision: Floats) -> tuple[Floats, Floats]:
         """B' W B and B' W y of all groups over their variances.
@@ -143,6 +142,48 @@ class Hyperprior:
 
 
 @dataclass(frozen=True, eq=False)
+class Conditional:
+    """The unknowns' normal law at given hyperparameters, over the roots of their prior variances.
+
+    Args:
+        root: of the prior variances, (k,).
+        factor: Cholesky's factor L of the precision L L', (k, k), of which the lower triangle is meant.
+        mean: (k,), over the roots.
+    """
+
+    root: Floats
+    factor: Floats
+    mean: Floats
+
+    @cached_property
+    def lower(self) -> Floats:
+        """The covariance, (k, k), of which the lower triangle is meant."""
+        found: Floats = dpotri(self.factor, lower=True)[0]
+        return found
+
+    @cached_property
+    def inverse(self) -> Floats:
+        """The covariance, (k, k)."""
+        lower = np.tril(self.lower)
+        return lower + np.tril(lower, -1).T
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Of the unknowns themselves, (k, k)."""
+        return self.root[:, None] * self.inverse * self.root
+
+    def solved(self, right: Floats) -> Floats:
+        """The unknowns' covariance times columns, (k, m)."""
+        found: Floats = self.root[:, None] * dpotrs(self.factor, self.root[:, None] * right, lower=True)[0]
+        return found
+
+    def square(self, change: Floats) -> float:
+        """A change of the unknowns, (k,), in their precision."""
+        turned = dtrmv(self.factor, change / self.root, lower=True, trans=True)
+        return float(turned @ turned)
+
+
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """Minus the logarithm of the evidence times what is believed, as a function of the hyperparameters.
 
@@ -157,6 +198,20 @@ class Evidence:
     noise: Variances
     prior: Variances
     hyperprior: Hyperprior
+    _known: dict[bytes, Conditional | None] = field(default_factory=dict, init=False, repr=False)
+
+    def with_tail(self, tail: Floats) -> Evidence:
+        """The same with squares for the tails that robust weights have cut off, (g,)."""
+        return self._alike(replace(self, problem=replace(self.problem, tail=tail)))
+
+    def with_minimum(self, place: int, value: float) -> Evidence:
+        """The same with a larger least value of one hyperparameter."""
+        return self._alike(replace(self, hyperprior=self.hyperprior.with_minimum(place, value)))
+
+    def _alike(self, other: Evidence) -> Evidence:
+        """The other, in which the unknowns have the same laws."""
+        other._known.update(self._known)
+        return other
 
     def value(self, eta: Floats) -> tuple[float, Floats]:
         """At logarithms of the hyperparameters, (h,), with the gradient, (h,)."""
@@ -166,44 +221,64 @@ class Evidence:
         """The same with about the second derivative by each: that expected of right hyperparameters, (h,)."""
         problem = self.problem
         (noise, by_noise), (logs, slopes) = self.noise(eta), self.prior(eta)
-        precision, root = np.exp(-noise), np.exp(0.5 * logs)
-        matrix, projection = self._scaled(precision, root)
-        factor, failed = dpotrf(matrix.T, lower=True, clean=False, overwrite_a=True)  # by columns: nothing is copied
-        if failed:
+        law = self._law(eta, noise, logs)
+        if law is None:
             return np.inf, np.zeros_like(eta), np.ones_like(eta)
-        half = float(np.log(np.diag(factor)).sum())
-        mean, _ = dpotrs(factor, projection, lower=True)  # over the roots of the variances
-        inverse, _ = dpotri(factor, lower=True, overwrite_c=True)
+        precision, moved = np.exp(-noise), law.root * law.mean
+        half = float(np.log(np.diag(law.factor)).sum())
+        projection = precision @ problem.projection
+        if problem.known is not None:
+            projection += problem.known[1]
         believed, gradient = self.hyperprior.cost(eta)
         square = float(precision @ (problem.square + problem.tail))
-        value = 0.5 * float(problem.count @ noise) + half + 0.5 * (square - float(mean @ projection)) + believed
-        told = 1.0 - np.diag(inverse)
-        gradient = gradient + 0.5 * slopes @ (told - mean**2)
+        value = 0.5 * float(problem.count @ noise) + half + 0.5 * (square - float(moved @ projection)) + believed
+        told = 1.0 - np.diag(law.lower)
+        gradient = gradient + 0.5 * slopes @ (told - law.mean**2)
         bend = self.hyperprior.bend + 0.5 * (slopes**2 @ told**2 + by_noise**2 @ problem.count)
         # y' W y - 2 m' B' W y + tr(B' W B (m m' + S)) of each group, over its variance
-        moved, second = root * mean, inverse.T  # of it the upper triangle counts
-        second *= root[:, None]
-        second *= root
+        second = law.root[:, None] * law.lower.T  # of it the upper triangle counts
+        second *= law.root
         second += moved[:, None] * moved
         data = problem.square + problem.tail - 2.0 * problem.projection @ moved + problem.upper @ second.ravel()
         return value, gradient + 0.5 * by_noise @ (problem.count - precision * data), bend
 
+    def conditional(self, eta: Floats) -> Conditional | None:
+        """The unknowns' law at logarithms of the hyperparameters; None where information and prior are too far apart.
+
+        Args:
+            eta: (h,).
+        """
+        return self._law(eta, self.noise(eta)[0], self.prior(eta)[0])
+
+    def _law(self, eta: Floats, noise: Floats, logs: Floats) -> Conditional | None:
+        key = eta.tobytes()
+        if key not in self._known:
+            root = np.exp(0.5 * logs)
+            matrix, projection = self._scaled(np.exp(-noise), root)
+            factor, failed = dpotrf(
+                matrix.T, lower=True, clean=False, overwrite_a=True
+            )  # by columns: nothing is copied
+            law = None if failed else Conditional(root, factor, dpotrs(factor, projection, lower=True)[0])
+            self._known[key] = law
+        return self._known[key]
+
     def mean(self, eta: Floats) -> Floats:
         """The unknowns' posterior mean at logarithms of the hyperparameters, (k,)."""
-        root = np.exp(0.5 * self.prior(eta)[0])
-        matrix, projection = self._scaled(np.exp(-self.noise(eta)[0]), root)
-        factor, failed = dpotrf(matrix.T, lower=True, clean=False, overwrite_a=True)
-        if failed:
+        law = self.conditional(eta)
+        if law is None:
             raise np.linalg.LinAlgError("Evidence.mean: what is known of the unknowns is not finite.")
-        found: Floats = root * dpotrs(factor, projection, lower=True)[0]
-        return found
+        return law.root * law.mean
+
+    def scaled(self, eta: Floats) -> Floats:
+        """The unknowns' precision over the roots of their prior variances, (k, k)."""
+        return self._scaled(np.exp(-self.noise(eta)[0]), np.exp(0.5 * self.prior(eta)[0]))[0]
 
     def _scaled(self, precision: Floats, root: Floats) -> tuple[Floats, Floats]:
         """Precision of the unknowns over the roots of their prior variances, (k, k), and B' W y over them, (k,)."""
         matrix, projection = self.problem.weighted(precision)
         matrix *= root[:, None]
         matrix *= root
-        matrix[np.diag_indices(len(root))] += 1.0 + _rounding(matrix)
+        matrix.flat[:: len(root) + 1] += 1.0 + _rounding(matrix)
         return matrix, root * projection
 
     def maximum(self, starts: Sequence[Floats]) -> Floats:
@@ -279,11 +354,11 @@ class Evidence:
         """
         problem = self.problem
         (noise, by_noise), (logs, slopes) = self.noise(eta), self.prior(eta)
-        precision, root = np.exp(-noise), np.exp(0.5 * logs)
-        matrix, projection = self._scaled(precision, root)
-        inverse = np.linalg.inv(matrix)
-        mean = inverse @ projection
-        spread, moved = root[:, None] * inverse * root, root * mean
+        law = self._law(eta, noise, logs)
+        if law is None:
+            raise np.linalg.LinAlgError("Evidence.curvature: what is known of the unknowns is not finite.")
+        precision, root, mean, inverse = np.exp(-noise), law.root, law.mean, law.inverse
+        spread, moved = law.covariance, root * mean
         upon = problem.projection - problem.information @ moved  # what the residuals of each group pull, (g, k)
         data = problem.square + problem.tail - 2.0 * problem.projection @ moved
         data += problem.upper @ (spread + moved[:, None] * moved).ravel()
@@ -292,7 +367,7 @@ class Evidence:
         pulls = sloped * mean - root * (weighed @ upon)
         grown = sloped[:, :, None] * inverse  # (D_b + N_b) S
         for each in np.flatnonzero(weighed.any(axis=1)):
-            part = (weighed[each] @ problem.information.reshape(len(precision), -1)).reshape(matrix.shape)
+            part = (weighed[each] @ problem.information.reshape(len(precision), -1)).reshape(inverse.shape)
             grown[each] += (root[:, None] * part * root) @ inverse
         flat = (len(places), -1)
         found = (sloped * (np.diag(inverse) + mean**2)) @ sloped.T + (by_noise[places] * data) @ weighed.T
@@ -303,6 +378,12 @@ class Evidence:
             found[:, column] += (self.prior(nearby)[1] - slopes)[places] @ told / _STEP
             found[:, column] += (self.noise(nearby)[1] - by_noise)[places] @ fit / _STEP
         return 0.5 * found + np.diag(self.hyperprior.bend_at(eta)[places])
+
+
+@lru_cache
+def _doubled(count: int) -> Floats:
+    """Weights of the upper triangle in the product of two symmetric matrices, (k, k)."""
+    return 2.0 * np.triu(np.ones((count, count))) - np.eye(count)
 
 
 def _put(places: NDArray[np.bool_], values: Floats) -> Floats:

@@ -105,13 +105,11 @@ class GaussNewton:
         settled: it has converged where less than this will be left after one more step, in posterior deviations a
             coefficient, by how much shorter steps become.
         enough: where no step lowers the objective further, or iterations run out, a step shorter than this counts as
-            settled: closest points jump from triangle to triangle, and no objective falls for ever.
+            settled: closest points pass from triangle to triangle, and no objective falls for ever.
         handed_on: the same for all losses but the last.
         graduation: the noise is taken as at least this part of what the linear model promises to change.
         max_step: first limit on the movement of any observed node in one step, part of the body's size.
         minimum_step: no step that moves all observed nodes less than this is tried, metres.
-        trusted: before the end closest points are searched anew, of points further from the surface than so many of
-            their deviations; 0 for all.
         is_near: the start is near: hyperparameters that are known there are sought anew with the last loss alone, and
             whether a step was the last is seen by the derivatives before it, where it kept what they promised.
         until: no step is begun after this time of the monotonic clock, seconds.
@@ -126,7 +124,6 @@ class GaussNewton:
     graduation: float = field(default_factory=lambda: ACCURACY.graduation)
     max_step: float = field(default_factory=lambda: ACCURACY.first_step)
     minimum_step: float = 1e-6
-    trusted: float = 0.0
     is_near: bool = False
     until: float = np.inf
     before_step: Callable[[], None] | None = None
@@ -148,8 +145,8 @@ class GaussNewton:
         return replace(self, settled=self.handed_on)
 
     def following(self) -> GaussNewton:
-        """The same from the state of a frame before: closest points and scales stay the same over so short a way."""
-        return replace(self, trusted=max(self.trusted, ACCURACY.trusted), is_near=True)
+        """The same from the state of a frame before: scales stay nearly the same over so short a way."""
+        return replace(self, is_near=True)
 
     def directly(self) -> GaussNewton:
         """The same with the last loss alone: where no part of the organ would be mistaken for outliers."""
@@ -176,7 +173,7 @@ class GaussNewton:
         return _Search(self, problem, start, near, eta).run()
 
     def has_settled(self, problem: Problem, evaluation: Evaluation, noise: float, eta: Floats | None = None) -> bool:
-        """Whether no step would be taken from a trial, its closest points left as they are.
+        """Whether no step would be taken from a trial.
 
         Args:
             problem: what is registered.
@@ -294,28 +291,20 @@ class _Search:
 
     def _descend(self, loss: Loss, settled: float, most: int = 0) -> Outcome:
         most = len(self.trace) + most if most else self.begun + self.options.max_iterations
-        is_handed_on, is_exact = settled >= self.options.handed_on, False
+        is_handed_on = settled >= self.options.handed_on
         left = float if is_handed_on else self._left
         while len(self.trace) < most:
             local = self._local(loss)
             if local.is_carried and (left(local.length) >= settled or local.is_graduated):
                 local = self._renewed(loss)
             if left(local.length) < settled and not local.is_graduated:
-                if is_handed_on or is_exact:
-                    return Outcome.CONVERGED
-                if left(self._closest_length(local)) < settled and left(self._local(loss).length) < self.options.enough:
-                    return Outcome.CONVERGED
-                is_exact = True
-                continue
-            is_exact = False
+                return Outcome.CONVERGED
             if self.options.before_step is not None:
                 self.options.before_step()
             if time.monotonic() >= self.options.until:
                 return Outcome.OUT_OF_TIME
             refused = self._step(local, loss)
             if refused is not None:
-                if not is_handed_on and self._lies_closer(local, loss):
-                    continue
                 return refused
             if is_handed_on and local.is_undamped and abs(self.trace[-1].gain - 1.0) < ACCURACY.kept:
                 return Outcome.CONVERGED
@@ -326,16 +315,15 @@ class _Search:
         coefficients = self.evaluation.coefficients + local.step(self.limit)
         with suppress(NotConverged):
             self.evaluations += 1
-            evaluated = self.problem.nearby if self.options.is_near else self.problem.evaluation
-            after = local.moved_to(evaluated(coefficients, self.evaluation))
+            after = local.moved_to(self.problem.evaluation(coefficients, self.evaluation))
             if after.value < local.value:
                 self.evaluation = after.evaluation
                 return after
         return local
 
     def _has_enough(self) -> bool:
-        local, enough = self._local(self.options.losses[-1]), self.options.enough
-        return local.length < enough and not local.is_graduated and self._closest_length(local) < enough
+        local = self._local(self.options.losses[-1])
+        return local.length < self.options.enough and not local.is_graduated
 
     def _left(self, length: float) -> float:
         """How long the steps after the next will be in all, where each is shorter than the last by the same factor.
@@ -353,22 +341,6 @@ class _Search:
             return length
         rate = min(length / known[-1].length, ACCURACY.slowest)
         return length * rate / (1.0 - rate)
-
-    def _closest_length(self, local: LocalModel) -> float:
-        """Search the closest points anew; the next step's length with them."""
-        before = self.evaluation.match.distances
-        again = self.problem.again(self.evaluation, self.options.trusted * robust_deviation(before))
-        if np.abs(again.match.distances - before).max() >= ACCURACY.unchanged * self.noise:
-            self.evaluation = again
-        return local.length_for(again)
-
-    def _lies_closer(self, local: LocalModel, loss: Loss) -> bool:
-        """Search the closest points anew where no step helps; True where a point that had walked astray lies closer."""
-        again = self.problem.again(self.evaluation)
-        if local.value - local.objective(again, loss) <= ACCURACY.closer * local.value:
-            return False
-        self.evaluation = again
-        return True
 
     def _step(self, local: LocalModel, loss: Loss) -> Outcome | None:
         """Take the best step within the limit; None when one was taken."""
@@ -401,9 +373,7 @@ class _Search:
 def _begun(problem: Problem, start: Floats, near: Evaluation | None) -> Evaluation:
     """The trial at the start: the one given, where it is of this cloud and has just these coefficients."""
     sized = problem.sized(start)
-    if near is None or near.given is not problem.cloud:
-        return problem.evaluation(sized, near, anew=True)
-    if near.coefficients is not start:
+    if near is None or near.given is not problem.cloud or near.coefficients is not start:
         return problem.evaluation(sized, near)
     return near if sized is start else replace(near, coefficients=sized)
 

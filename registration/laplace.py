@@ -18,8 +18,7 @@ def posterior(local: LocalModel) -> Posterior:
     Args:
         local: the objective's model there.
     """
-    shares = np.einsum("ij,ji->i", local.inverse, local.informed)
-    informed = float(shares[local.problem.moving].sum())
+    informed = float(local.informed[local.problem.moving].sum())
     moved, spread = _by_hyperparameters(local)
     covariance = error_covariance(local) + moved @ spread @ moved.T
     return Posterior(local.evaluation.coefficients, covariance, local.scales, informed)

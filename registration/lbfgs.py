@@ -66,7 +66,7 @@ class LBFGS:
         return self
 
     def following(self) -> LBFGS:
-        """The same: every closest point is searched anew in any case."""
+        """The same: it asks nothing of where it starts."""
         return self
 
     def directly(self) -> LBFGS:
@@ -101,7 +101,7 @@ class _TimeIsOver(Exception):  # noqa: N818 - no error
 class _Run:
     def __init__(self, options: LBFGS, problem: Problem, start: Floats, near: Evaluation | None) -> None:
         self.options, self.whole, self.problem = options, problem, problem.unshared
-        self.evaluation = self.best = self.problem.evaluation(self.problem.sized(start), near, anew=True)
+        self.evaluation = self.best = self.problem.evaluation(self.problem.sized(start), near)
         self.evaluations, self.trace = 1, list[IterationRecord]()
         penalty = options.penalty
         self.cost = None if penalty is None else penalty.of(problem.observed.body, problem.forces)
@@ -144,7 +144,7 @@ class _Run:
                 raise _TimeIsOver
             self.evaluations += 1
             try:
-                evaluation = problem.evaluation(root * scaled, self.evaluation, anew=True)
+                evaluation = problem.evaluation(root * scaled, self.evaluation)
             except NotConverged:  # a wall that the line search steps back from
                 met_wall = True
                 return _WALL * max(minimum, 1.0), np.zeros_like(scaled)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from .evaluation import Evaluation
-from .evidence import Evidence, LinearProblem
+from .evidence import Conditional, Evidence, LinearProblem
 from .hyperparameters import DISCREPANCY, LENGTH, NOISE, SHARED, Hyperparameters
 from .loss import Loss
 from .policy import ACCURACY
@@ -77,7 +75,6 @@ class LocalModel:
             summed = replace(self._evidence_of(residuals, self.weights).problem, tail=self.evidence.problem.tail)
             self.evidence, self.evidence_weights = replace(self.evidence, problem=summed), self.weights
         self.precision = np.exp(-problem.prior_variances(self.eta)[0])
-        self._inform()
         self.gradient = self._gradient(residuals, self.weights)
 
     @property
@@ -107,7 +104,7 @@ class LocalModel:
             self.evidence_weights * (residuals + self.jacobian @ (found.mean(eta) - self.evaluation.coefficients)) ** 2
         )
         tail = (1.0 / self.loss.consistency - 1.0) * np.array([left[group].sum() for group in self._groups])
-        return replace(found, problem=replace(found.problem, tail=tail))
+        return found.with_tail(tail)
 
     def _evidence_of(self, residuals: Floats, weights: Floats) -> Evidence:
         """The same with given weights, (p,), and no tails."""
@@ -135,23 +132,13 @@ class LocalModel:
         minimum = np.log(max(graduation * self._promised(evidence, eta), 1e-300))
         if minimum <= eta[NOISE]:
             return eta, False
-        held = replace(evidence, hyperprior=evidence.hyperprior.with_minimum(NOISE, minimum))
-        return held.maximum([eta]), True
+        return evidence.with_minimum(NOISE, minimum).maximum([eta]), True
 
     def _promised(self, evidence: Evidence, eta: Floats) -> float:
         """Root mean square change of the residuals by the best step at some hyperparameters, metres."""
         linear, step = evidence.problem, evidence.mean(eta) - self.evaluation.coefficients
         square = float((linear.information @ step @ step).sum())
         return float(np.sqrt(max(square, 0.0) / max(linear.count.sum(), 1.0)))
-
-    @cached_property
-    def whitened(self) -> Floats:
-        """The derivatives over the points' deviations, as they were counted, (p, k)."""
-        return self._root[:, None] * self.jacobian
-
-    @property
-    def _root(self) -> Floats:
-        return np.sqrt(self.evidence_weights) / self.deviations
 
     def score_of(self, columns: Floats) -> tuple[Floats, Floats]:
         """Slope of the logarithm of the likelihood by parameters that are none here, (m,), and its covariance, (m, m).
@@ -161,54 +148,47 @@ class LocalModel:
         Args:
             columns: derivative of the distances by these parameters, (p, m).
         """
-        weighted, residuals = self._root[:, None] * columns, self.problem.residuals(self.evaluation, self.point_noise)
-        across = self.whitened.T @ weighted
+        weighted = (self.evidence_weights / self.deviations**2)[:, None] * columns
+        residuals = self.problem.residuals(self.evaluation, self.point_noise)
+        across = self.jacobian.T @ weighted
         solved = self.solved(across)
         # What the last step, which was not taken, would still change of the residuals counts, too.
         pull = solved.T @ self.gradient - (self.weights * residuals / self.deviations**2) @ columns
-        return pull, weighted.T @ weighted - across.T @ solved
+        return pull, columns.T @ weighted - across.T @ solved
 
     @cached_property
-    def _scaled_hessian(self) -> Floats:
-        """In coefficients of unit prior variance: forces in newtons and poses differ by orders of size."""
-        root = 1.0 / np.sqrt(self.precision)
-        return root[:, None] * self._hessian * root
+    def _law(self) -> Conditional | None:
+        """The normal law of the unknowns; None where information and prior are too far apart for Cholesky's factor."""
+        return self.evidence.conditional(self.eta)
 
     @cached_property
     def _eigen(self) -> tuple[Floats, Floats]:
-        """For steps that have to be damped."""
-        values, vectors = np.linalg.eigh(self._scaled_hessian)
+        """Of the Hessian in coefficients of unit prior variance, for steps that have to be damped."""
+        values, vectors = np.linalg.eigh(self.evidence.scaled(self.eta))
         return values, vectors
-
-    @cached_property
-    def _factor(self) -> tuple[Floats, bool] | None:
-        """Cholesky's factor; None where information and prior are too far apart for it."""
-        with suppress(np.linalg.LinAlgError):
-            factor: tuple[Floats, bool] = cho_factor(self._scaled_hessian, check_finite=False)
-            return factor
-        return None
-
-    def _whole_for(self, gradient: Floats) -> Floats:
-        return -self.solved(gradient[:, None])[:, 0]
 
     def solved(self, right: Floats) -> Floats:
         """The inverse of the Hessian, the posterior's precision, times columns, (k, m)."""
-        root = 1.0 / np.sqrt(self.precision)[:, None]
-        if self._factor is not None:
-            found: Floats = root * cho_solve(self._factor, root * right, check_finite=False)
-            return found
-        values, vectors = self._eigen  # with the prior none is below 1, whatever round-off says
+        if self._law is not None:
+            return self._law.solved(right)
+        root, (values, vectors) = 1.0 / np.sqrt(self.precision)[:, None], self._eigen
+        # With the prior none is below 1, whatever round-off says.
         return np.asarray(root * (vectors @ (vectors.T @ (root * right) / np.maximum(values, 1.0)[:, None])))
 
     @cached_property
     def inverse(self) -> Floats:
         """Of the Hessian."""
-        return self.solved(np.eye(self.problem.size))
+        return self.solved(np.eye(self.problem.size)) if self._law is None else self._law.covariance
+
+    @property
+    def informed(self) -> Floats:
+        """Share of each coefficient that the points tell, and not what was believed, (k,)."""
+        return 1.0 - self.precision * np.diag(self.inverse)
 
     @cached_property
     def _whole(self) -> Floats:
         """The whole step."""
-        return self._whole_for(self.gradient)
+        return -self.solved(self.gradient[:, None])[:, 0]
 
     @cached_property
     def value(self) -> float:
@@ -230,12 +210,6 @@ class LocalModel:
         """Length of the whole step in posterior deviations a coefficient."""
         return _length(self._whole, self.gradient)
 
-    def length_for(self, evaluation: Evaluation) -> float:
-        """The same at a trial of the same coefficients with other closest points, with these derivatives."""
-        residuals = self.problem.residuals(evaluation, self.point_noise)
-        gradient = self._gradient(residuals, self.loss.weight(residuals / self.deviations))
-        return _length(self._whole_for(gradient), gradient)
-
     def moved_to(self, evaluation: Evaluation) -> LocalModel:
         """The same about a trial so near that derivatives, hyperparameters and what the points tell are the same."""
         other = copy.copy(self)
@@ -248,11 +222,6 @@ class LocalModel:
             other._beside = self._beside + self._by_terms @ (evaluation.coefficients - self.evaluation.coefficients)
         other.gradient = other._gradient(residuals, other.weights)
         return other
-
-    def _inform(self) -> None:
-        """What the points tell by the weights that they were counted with, and what was believed."""
-        self.informed = self.evidence.problem.weighted(np.exp(-self.evidence.noise(self.eta)[0]))[0]
-        self._hessian = self.informed + np.diag(self.precision)
 
     def _damped(self, damping: float) -> Floats:
         values, vectors = self._eigen
@@ -271,7 +240,10 @@ class LocalModel:
 
     def decrease(self, change: Floats) -> float:
         """Decrease of the objective that the model predicts."""
-        return -float(self.gradient @ change + 0.5 * change @ self._hessian @ change)
+        if self._law is not None:
+            return -float(self.gradient @ change) - 0.5 * self._law.square(change)
+        scaled = change * np.sqrt(self.precision)
+        return -float(self.gradient @ change + 0.5 * scaled @ self.evidence.scaled(self.eta) @ scaled)
 
     def largest_movement(self, change: Floats) -> float:
         """Largest predicted movement of an observed node, metres."""

@@ -215,11 +215,6 @@ class Accuracy:
     iterations: int = count(40, "", "most iterations of Gauss-Newton")
     few_iterations: int = count(8, "", "most for a start, and before noise that neighbours share is thought of")
     kept: float = choice(0.2, "of what a step promised", "derivatives are kept after a step that missed it by less")
-    trusted: float = choice(
-        3.0, "deviations", "points nearer to the surface are not searched anew before the end of a tracked frame"
-    )
-    closer: float = choice(1e-3, "of the objective", "closest points searched anew have to take away to go on")
-    unchanged: float = choice(0.3, "times the noise", "a smaller change of a distance is not looked at")
     summed: float = choice(0.02, "of all weights", "points are summed anew where weights have changed by more")
     groups: int = count(6, "", "groups of points by how far the model's error makes them doubtful")
     lengths: int = count(5, "", "lengths of shared noise that are looked at")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import cast
 
@@ -20,7 +20,7 @@ from .parameters.discrepancy import ModelError
 from .parameters.stack import ParameterStack
 from .policy import ACCURACY, POLICY
 from .residuals.term import ResidualTerm
-from .surface_distance import Correspondence, SurfaceDistance, expected_distance
+from .surface_distance import SurfaceDistance, expected_distance
 
 Floats = NDArray[np.float64]
 
@@ -99,47 +99,16 @@ class Problem(ParameterStack):
 
     # ------------------------------------------------------------------ trials
 
-    def evaluation(self, coefficients: Floats, near: Evaluation | None = None, *, anew: bool = False) -> Evaluation:
+    def evaluation(self, coefficients: Floats, near: Evaluation | None = None) -> Evaluation:
         """The problem at some coefficients.
 
         Args:
             coefficients: (k,).
-            near: a trial to start the model from and to walk the closest points from.
-            anew: search the closest points anew all the same.
+            near: a trial to start the model from, of this cloud or of another.
 
         Raises:
             NotConverged: the model found no state.
         """
-        from_match = None if near is None or anew else near.match
-        return self._at(coefficients, near, lambda moved, cloud: self.observed.match(moved, cloud, from_match))
-
-    def nearby(self, coefficients: Floats, near: Evaluation) -> Evaluation:
-        """The same so near a trial that each point's closest one stays on its triangle.
-
-        Args:
-            coefficients: (k,).
-            near: the trial.
-
-        Raises:
-            NotConverged: the model found no state.
-        """
-        return self._at(coefficients, near, lambda moved, cloud: self.observed.match_held(moved, cloud, near.match))
-
-    def begun(self, coefficients: Floats, near: Evaluation | None = None) -> Evaluation:
-        """The same for another cloud than the trial's: closest points by the nearest vertices, good for a start.
-
-        Args:
-            coefficients: (k,).
-            near: a trial to start the model from.
-
-        Raises:
-            NotConverged: the model found no state.
-        """
-        return self._at(coefficients, near, self.observed.match_nearby)
-
-    def _at(
-        self, coefficients: Floats, near: Evaluation | None, matched: Callable[[Floats, Floats], Correspondence]
-    ) -> Evaluation:
         state, scaling = self._state(coefficients, None if near is None else near.state)
         positions = state.positions
         for block, part in self.parts:
@@ -148,7 +117,7 @@ class Problem(ParameterStack):
                 positions = positions + added
         pose = None if self.pose is None else self.pose.pose(coefficients[self.pose_part])
         cloud = self.cloud if pose is None else pose.inverse().apply(self.cloud)
-        match = matched(positions, cloud)
+        match = self.observed.match(positions, cloud)
         return Evaluation(coefficients, self.observed, state, positions, pose, self.cloud, cloud, match, scaling)
 
     def _state(self, coefficients: Floats, near: ReducedState | None) -> tuple[ReducedState, float]:
@@ -159,16 +128,6 @@ class Problem(ParameterStack):
         own = coefficients[self.input_part]
         state = cast(ParametrisedModel, self.model).solve(forces, near, own)
         return state, self.inputs.stiffness_scaling(own)[0]
-
-    def again(self, evaluation: Evaluation, beyond: float = 0.0) -> Evaluation:
-        """The same trial with closest points searched anew.
-
-        Args:
-            evaluation: at some coefficients.
-            beyond: only of points further than this from the surface, metres.
-        """
-        match = self.observed.match_beyond(evaluation.positions, evaluation.cloud, evaluation.match, beyond)
-        return replace(evaluation, match=match)
 
     def correction(self, evaluation: Evaluation) -> Floats:
         """What blocks add to the displacement of all nodes beside the state, (n, 3), metres."""
@@ -188,6 +147,9 @@ class Problem(ParameterStack):
             evaluation: at some coefficients.
             noise: standard deviation of each coordinate of a point, metres.
         """
+        return evaluation.once((self, noise), lambda: self._residuals(evaluation, noise))
+
+    def _residuals(self, evaluation: Evaluation, noise: float) -> Floats:
         curvature = evaluation.once("curvature", lambda: self.observed.curvature(evaluation.match))
         unexplained = evaluation.once(self, lambda: self._unexplained(evaluation))
         return unexplained - expected_distance(curvature, noise)

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, kron
 
 from softtwin.meshes.body import Body, Surface
-from softtwin.meshes.closest import ClosestPoints, closest_in_triangles
 from softtwin.meshes.curvature import mean_curvature
 from softtwin.meshes.embedding import outer
+from softtwin.meshes.triangle_tree import TriangleTree
 
 from .policy import ACCURACY
 from .surface_modes import SurfaceModes, surface_modes
@@ -69,7 +69,7 @@ class SurfaceDistance:
         self.nodes = surface.nodes_of(vertices)
         self.rest: Floats = surface.rest.points[vertices]
         self._weights = None if surface.weights is None else surface.weights[vertices][:, self.nodes]
-        self._closest = ClosestPoints(self.triangles, len(vertices))
+        self._tree = TriangleTree(self.rest, self.triangles)
 
     def _carried(self, field: Floats) -> Floats:
         """A field of the nodes `nodes`, (m, ...), at the vertices of the observed side, (v, ...)."""
@@ -96,63 +96,15 @@ class SurfaceDistance:
         """The smoothest functions on the observed side at rest."""
         return surface_modes(self.rest, self.triangles, ACCURACY.surface_modes)
 
-    def match(self, displacement: Floats, cloud: Floats, near: Correspondence | None = None) -> Correspondence:
+    def match(self, displacement: Floats, cloud: Floats) -> Correspondence:
         """A cloud (p, 3) matched to the surface moved by the displacement (m, 3) of the nodes `nodes`, metres.
 
         Args:
             displacement: of the nodes `nodes`, (m, 3), metres.
             cloud: points, (p, 3), metres.
-            near: a match of the same cloud to walk from, faster; the search starts anew if not given.
         """
         positions = self.rest + self._carried(displacement)
-        if near is None:
-            return self._matched(positions, cloud, *self._closest.find(positions, cloud))
-        return self._matched(positions, cloud, *self._closest.follow(positions, cloud, near.triangles))
-
-    def match_held(self, displacement: Floats, cloud: Floats, near: Correspondence) -> Correspondence:
-        """The same on the triangles of a match: the closest where the surface has moved much less than an edge.
-
-        Args:
-            displacement: of the nodes `nodes`, (m, 3), metres.
-            cloud: points, (p, 3), metres.
-            near: a match of the same cloud.
-        """
-        positions = self.rest + self._carried(displacement)
-        weights = closest_in_triangles(positions[self.triangles[near.triangles]], cloud)[0]
-        return self._matched(positions, cloud, near.triangles, weights)
-
-    def match_nearby(self, displacement: Floats, cloud: Floats) -> Correspondence:
-        """The same by a walk from each point's nearest vertex: faster than anew, in rare places not the closest.
-
-        Args:
-            displacement: of the nodes `nodes`, (m, 3), metres.
-            cloud: points, (p, 3), metres.
-        """
-        positions = self.rest + self._carried(displacement)
-        return self._matched(positions, cloud, *self._closest.near(positions, cloud))
-
-    def match_beyond(
-        self, displacement: Floats, cloud: Floats, near: Correspondence, distance: float
-    ) -> Correspondence:
-        """A match found by walking, with the points that lie further than a distance from the surface searched anew.
-
-        Args:
-            displacement: of the nodes `nodes`, (m, 3), metres.
-            cloud: points, (p, 3), metres.
-            near: a match at this displacement.
-            distance: metres; what is closer may lie closer still at another place, but no more than that.
-        """
-        if self._closest.is_small:
-            return near
-        far = np.flatnonzero(np.abs(near.distances) > distance) if distance > 0.0 else np.arange(len(cloud))
-        if not len(far):
-            return near
-        positions = self.rest + self._carried(displacement)
-        triangles, weights = near.triangles.copy(), near.weights.copy()
-        triangles[far], weights[far] = self._closest.find(positions, cloud[far])
-        return self._matched(positions, cloud, triangles, weights)
-
-    def _matched(self, positions: Floats, cloud: Floats, triangles: Ints, weights: Floats) -> Correspondence:
+        triangles, weights = self._tree.closest(positions, cloud)
         corners = positions[self.triangles[triangles]]
         offsets = np.einsum("pk,pki->pi", weights, corners) - cloud
         lengths = np.sqrt(np.einsum("pi,pi->p", offsets, offsets))

@@ -455,8 +455,7 @@ class ReducedSurrogateState:
             change: of the coefficients.
             every: of so many nodes one, the first of all to begin with.
         """
-        some = self.model.rows.reshape(-1, 3, self.model.rows.shape[1])[::every]
-        return some @ np.concatenate([change, self._tangent @ change])
+        return (self.model.some_rows(every) @ np.concatenate([change, self._tangent @ change])).reshape(-1, 3)
 
 
 class ReducedSurrogate:
@@ -480,16 +479,25 @@ class ReducedSurrogate:
             [self._linear_rows, self._decode_rows]
         )  # by the coefficients and by what the network says
         self.offset_rows = encoder_decoder.offset[picked]
+        self._some: tuple[int, Floats] | None = None
 
     @property
     def count(self) -> int:
         """Number of coefficients, k."""
         return self.encode.shape[1]
 
+    def some_rows(self, every: int) -> Floats:
+        """The rows of one chosen node of so many, the first to begin with, (3q, k + r)."""
+        if self._some is None or self._some[0] != every:
+            rows = self.rows.reshape(-1, 3, self.rows.shape[1])[::every]
+            self._some = every, np.ascontiguousarray(rows.reshape(-1, self.rows.shape[1]))
+        return self._some[1]
+
     def combined(self, matrix: Floats) -> ReducedSurrogate:
         """The same for the basis times a matrix, (k, j), for the price of some small products."""
         other = copy.copy(self)
         other.__dict__.pop("_linear", None)
+        other._some = None
         other.encode, other._combination = self.encode @ matrix, self._combination @ matrix
         other._linear_rows = self._linear_rows @ matrix
         other.rows = np.hstack([other._linear_rows, self._decode_rows])

@@ -51,7 +51,7 @@ def refine(
     problem = setup.plain(points, prepared)
     start = problem.carried(draft.coefficients, draft.problem)
     start[problem.force_part] = prepared.forces.nearest(draft.unknown_forces)
-    found = _approached(setup, problem, problem.begun(start, draft.evaluation), fast, solver, draft.eta)
+    found = _approached(setup, problem, problem.evaluation(start, draft.evaluation), fast, solver, draft.eta)
     return finish(setup, points, Localised(prepared, found))
 
 
@@ -75,7 +75,7 @@ def _approached(
         place = near.coefficients[problem.force_part]
         reduced = setup.reduced(fast, problem.forces)
         cheap = replace(problem, model=ManifoldMapping.at(reduced, setup.observed.nodes, place, near.state))
-        way = solver.solve(cheap, near.coefficients, cheap.begun(near.coefficients), eta)
+        way = solver.solve(cheap, near.coefficients, cheap.evaluation(near.coefficients), eta)
         eta = way.local.eta
         if not way.trace or setup.is_late:
             break
@@ -88,5 +88,5 @@ def _approached(
         if solver.has_settled(exact, near, way.local.noise, eta):
             break
     if near.given is not problem.cloud:
-        near = problem.begun(near.coefficients.copy(), near)
+        near = problem.evaluation(near.coefficients.copy(), near)
     return reduce(after, [*spent, solver.solve(problem, near.coefficients, near, eta)])

@@ -25,7 +25,7 @@ def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
     """
     prepared = setup.followed(last.prepared)
     problem = setup.problem(points, prepared, last.evaluation.positions, last.rms_distance)
-    near = problem.begun(problem.carried(last.evaluation.coefficients, last.problem), last.evaluation)
+    near = problem.evaluation(problem.carried(last.evaluation.coefficients, last.problem), last.evaluation)
     if _is_nearer_at_rest(setup, near, last):  # the tool has let go: no way back through all states between
         begun = from_rest(setup, points, prepared, setup.options.solver)
         return finish(setup, points, Localised(prepared, begun))

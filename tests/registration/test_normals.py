@@ -99,7 +99,7 @@ def test_planes_have_exact_derivatives(body: Body, rng: np.random.Generator) -> 
     direction = rng.standard_normal(u.shape)
     slope = observed.rows(start) @ direction.ravel()
     steps = 2e-4 * 0.5 ** np.arange(5)
-    moved = [observed.match(u + h * direction, cloud, start).distances for h in steps]
+    moved = [observed.match(u + h * direction, cloud).distances for h in steps]
     errors = [np.median(np.abs(m - start.distances - h * slope)) for m, h in zip(moved, steps, strict=True)]
     assert np.median(np.log2(np.divide(errors[:-1], errors[1:]))) > 1.9
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body
-from softtwin.meshes.closest import ClosestPoints, closest_in_triangles
 from softtwin.meshes.clouds import partial_view
 from softtwin.meshes.embedding import outer_nodes
 from softtwin.meshes.grid import gridded
@@ -147,88 +144,6 @@ def test_closest_points_are_the_closest(body: Body, observed: SurfaceDistance, r
     dense = np.einsum("qk,tki->tqi", weights, body.points[body.surfaces["observed"]]).reshape(-1, 3)
     brute = np.linalg.norm(cloud[:, None] - dense[None], axis=2).min(axis=1)
     assert (found <= brute + 1e-12).all() and (brute - found).max() < 5e-3  # sampling finds nothing nearer
-
-
-@pytest.fixture
-def walking(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Closest points are walked to on a small surface, too."""
-    monkeypatch.setattr("softtwin.meshes.closest._FEW", 0)
-
-
-def test_on_a_small_surface_all_are_searched_anew(body: Body, observed: SurfaceDistance, rng) -> None:
-    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement
-    cloud, moved = cloud_on(body, truth, 300, rng, 5e-3), truth[observed.nodes]
-    exact = observed.match(moved, cloud)
-    astray = replace(exact, triangles=np.zeros(300, dtype=int))
-    for found in (observed.match(moved, cloud, astray), observed.match_nearby(moved, cloud)):
-        np.testing.assert_array_equal(found.distances, exact.distances)
-    assert observed.match_beyond(moved, cloud, exact, 0.0) is exact
-
-
-@pytest.mark.usefixtures("walking")
-def test_following_finds_what_searching_finds(body: Body, rng) -> None:
-    """After a move, but for a few points beside an edge, where a local minimum is not the global one."""
-    closest = ClosestPoints(body.surfaces["observed"], len(body.points))
-    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement
-    cloud = cloud_on(body, truth, 200, rng, noise=1e-3)
-    before, _ = closest.find(body.points, cloud)
-    positions = (body.points + truth)[body.surfaces["observed"]]
-    lengths = [
-        np.linalg.norm(np.einsum("pk,pki->pi", weights, positions[triangles]) - cloud, axis=1)
-        for triangles, weights in (
-            closest.find(body.points + truth, cloud),
-            closest.follow(body.points + truth, cloud, before),
-        )
-    ]
-    assert (lengths[1] >= lengths[0] - 1e-12).all()
-    assert np.isclose(*lengths, atol=1e-12).mean() > 0.9
-
-
-@pytest.mark.usefixtures("walking")
-def test_a_point_between_two_triangles_stays(body: Body, rng, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Feet on edges and vertices are as near on each triangle but for rounding: no going to and fro."""
-    closest = ClosestPoints(body.surfaces["observed"], len(body.points))
-    cloud = cloud_on(body, np.zeros_like(body.points), 500, rng, noise=3e-2)
-    found, _ = closest.find(body.points, cloud)
-    asked, best = [], ClosestPoints._best
-    monkeypatch.setattr(ClosestPoints, "_best", lambda *of: (asked.append(len(of[2])), best(*of))[1])
-    closest.follow(body.points, cloud, found)
-    assert asked[0] > 20 and len(asked) <= 2
-
-
-@pytest.mark.usefixtures("walking")
-def test_only_far_points_are_searched_anew(body: Body, observed: SurfaceDistance, rng) -> None:
-    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement
-    cloud, moved = cloud_on(body, truth, 300, rng, 5e-3), truth[observed.nodes]
-    astray = observed.match(moved, cloud, replace(observed.match(moved, cloud), triangles=np.zeros(300, dtype=int)))
-    exact, limit = observed.match(moved, cloud).distances, float(np.quantile(np.abs(astray.distances), 0.7))
-    some = observed.match_beyond(moved, cloud, astray, limit).distances
-    far = np.abs(astray.distances) > limit
-    assert (np.abs(astray.distances[far]) > np.abs(exact[far]) + 1e-9).any()
-    np.testing.assert_array_equal(some, np.where(far, exact, astray.distances))
-    np.testing.assert_array_equal(observed.match_beyond(moved, cloud, astray, 0.0).distances, exact)
-
-
-@pytest.mark.usefixtures("walking")
-def test_the_nearest_vertex_leads_to_the_closest_point(body: Body, observed: SurfaceDistance, rng) -> None:
-    """Of points near the surface; those that it does not lead there are farther off than the closest, never nearer."""
-    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement[observed.nodes]
-    cloud = cloud_on(body, Cantilever(body).solve(tip_forces(body, (0.0, 0.1, -0.3))).displacement, 300, rng, 1e-3)
-    nearby, exact = (np.abs(found(truth, cloud).distances) for found in (observed.match_nearby, observed.match))
-    assert (nearby >= exact - 1e-12).all()
-    assert np.isclose(nearby, exact, atol=1e-12).mean() > 0.97
-
-
-def test_the_closest_point_of_a_triangle_lies_in_it(rng) -> None:
-    corners, points = rng.standard_normal((500, 3, 3)), 3.0 * rng.standard_normal((500, 3))
-    weights, squares = closest_in_triangles(corners, points)
-    assert weights.min() > -1e-12
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
-    samples = np.einsum("qk,pki->pqi", rng.dirichlet(np.full(3, 0.5), size=2000), corners)
-    brute = ((samples - points[:, None]) ** 2).sum(axis=2).min(axis=1)
-    assert (squares <= brute + 1e-9).all()
-    places = np.einsum("pk,pki->pi", weights, corners)
-    np.testing.assert_allclose(((places - points) ** 2).sum(axis=1), squares, rtol=1e-8)
 
 
 def test_what_is_not_seen_pulls_nothing(body: Body, observed: SurfaceDistance, rng) -> None:
