@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dtrmv
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
-from scipy.optimize import minimize
 
 from .hyperparameters import LogNormalPrior
 
@@ -30,7 +29,11 @@ Ints = NDArray[np.int64]
 # Logarithms of variances as functions of the logarithms eta of the hyperparameters, with their derivatives.
 Known = tuple[float, Floats]  # a value and its gradient
 Variances = Callable[[Floats], tuple[Floats, Floats]]
-_DESCENT = {"maxiter": 20, "ftol": 1e-7, "gtol": 0.1, "maxls": 10}  # of a standard deviation of a logarithm
+_STEPS, _TRIALS = 20, 10  # of a descent, and lengths of each
+_FLAT = 0.1  # slope a standard deviation of a logarithm, below which a descent ends
+_GAIN = 1e-7  # of the cost: so little gained ends it, too
+_LONGEST = 3.0  # standard deviations that a step may take
+_ENOUGH = 1e-4  # of what the slope promises has a step to gain (Armijo)
 _BEHIND = 30.0  # of the logarithm of the evidence: no descent begins so far behind the best so far
 _STEP = 1e-5  # of a logarithm, for a difference
 _AT_BOUND = 0.02  # of a logarithm: so near to a bound a hyperparameter lies at it
@@ -299,23 +302,21 @@ class Evidence:
         for start, first, slope, bend in sorted(begun, key=lambda at: at[1]):
             if first > lowest + _BEHIND:
                 break
-            # In standard deviations of each: a bounded descent's first step is as long as the gradient.
+            # In standard deviations of each, where the cost bends like a square.
             place, unit = start[sought], 1.0 / np.sqrt(bend[sought])
-            known = (first, slope[sought] * unit)
 
-            def cost(part: Floats, start: Floats = start, unit: Floats = unit, known: Known = known) -> Known:
-                if not part.any():
-                    return known
+            def cost(part: Floats, start: Floats = start, unit: Floats = unit) -> Known:
                 eta = start.copy()
                 eta[sought] += unit * part
-                value, gradient, _ = self._at(eta)
+                value, gradient, _ = self._at(hyperprior.within(eta))
                 return value, gradient[sought] * unit
 
-            within = (bounds - place[:, None]) / unit[:, None]
-            found = minimize(cost, np.zeros(len(place)), jac=True, method="L-BFGS-B", bounds=within, options=_DESCENT)
-            if np.isfinite(found.fun) and found.fun < lowest:
-                lowest, best = float(found.fun), start.copy()
-                best[sought] = hyperprior.within(start + _put(sought, unit * found.x))[sought]
+            low, high = ((bounds - place[:, None]) / unit[:, None]).T
+            least, found = _descended(cost, (first, slope[sought] * unit), low, high)
+            if np.isfinite(least) and least < lowest:
+                lowest, best = least, start.copy()
+                best[sought] += unit * found
+                best = hyperprior.within(best)
         if not np.isfinite(lowest):
             raise ArithmeticError("Evidence.maximum: the evidence is finite at none of the starts.")
         return best
@@ -386,11 +387,45 @@ def _doubled(count: int) -> Floats:
     return 2.0 * np.triu(np.ones((count, count))) - np.eye(count)
 
 
-def _put(places: NDArray[np.bool_], values: Floats) -> Floats:
-    """Values at some places, zero elsewhere, (h,)."""
-    found = np.zeros(len(places))
-    found[places] = values
-    return found
+def _descended(cost: Callable[[Floats], Known], first: Known, low: Floats, high: Floats) -> tuple[float, Floats]:
+    """The least of a smooth cost within bounds, and where, (q,), by projected BFGS from zero.
+
+    For the handful of unknowns here, a step in which takes less than a library spends on calling itself.
+
+    Args:
+        cost: value and gradient, in units in which the cost bends about like a square.
+        first: the same at zero.
+        low: least values, (q,).
+        high: largest values, (q,).
+    """
+    place, (value, slope), inverse = np.zeros(len(low)), first, np.eye(len(low))
+    for _ in range(_STEPS):
+        held = ((place <= low) & (slope > 0.0)) | ((place >= high) & (slope < 0.0))
+        if not np.abs(slope[~held]).max(initial=0.0) > _FLAT:
+            break
+        free = np.where(held, 0.0, slope)
+        step = np.where(held, 0.0, -inverse @ free)
+        if not step @ free < 0.0:
+            step, inverse = -free, np.eye(len(low))
+        step *= min(1.0, _LONGEST / np.abs(step).max())
+        for _ in range(_TRIALS):
+            trial = np.clip(place + step, low, high)
+            reached, there = cost(trial)
+            if reached <= value + _ENOUGH * float(slope @ (trial - place)):
+                break
+            step *= 0.3
+        else:
+            break
+        moved, turned = trial - place, there - slope
+        bend, gained = float(moved @ turned), value - reached
+        place, value, slope = trial, reached, there
+        if gained <= _GAIN * max(abs(value), 1.0):
+            break
+        if bend > 0.0:
+            wanted = inverse @ turned
+            inverse = inverse + (bend + turned @ wanted) / bend**2 * moved[:, None] * moved
+            inverse -= (wanted[:, None] * moved + moved[:, None] * wanted) / bend
+    return value, place
 
 
 def _rounding(matrix: Floats) -> float:

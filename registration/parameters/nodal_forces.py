@@ -9,6 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import lstsq
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 
@@ -113,7 +114,8 @@ class NodalForces(ParameterBlock):
 
     def nearest(self, nodal: Floats) -> Floats:
         """Coefficients, (k,), of the forces of this kind that are nearest to nodal ones, (n, 3), newtons."""
-        found: Floats = np.linalg.lstsq(self.patterns, nodal[self.nodes].ravel(), rcond=None)[0]
+        wanted, driver = nodal[self.nodes].ravel(), "gelsy"  # several times as fast as by singular values
+        found: Floats = lstsq(self.patterns, wanted, check_finite=False, lapack_driver=driver)[0]
         return found
 
     def combined(self, kept: Floats) -> NodalForces:
@@ -140,8 +142,8 @@ class NodalForces(ParameterBlock):
 
 
 def _net(patterns: Floats) -> Floats:
-    summed: Floats = patterns.reshape(len(patterns) // 3, 3, patterns.shape[1]).sum(axis=0)
-    return summed
+    """Net force of each pattern, (3, k)."""
+    return _parted_net(np.ones(len(patterns)), patterns)
 
 
 def nodal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, smoothness: float = 0.0) -> NodalForces:
