@@ -32,7 +32,9 @@ _DIFFERENCE = 1e-2  # of the linear response: a step of a central difference of 
 _ITERATIONS, _ESCAPES = 200, 3  # of Newton's method; from balanced states that are not stable
 _DESCENT = 1e-4  # of what the slope promises
 _SHORTEST = 1e-6
-_FAST = 0.1  # by which out-of-balance forces are to fall in a step, or the tangent is made anew
+_FAST = (
+    0.4  # by which out-of-balance forces are to fall in a step, or the tangent is made anew: that costs five of these
+)
 _SHIFTS = tuple(1e-3 * 4.0**i for i in range(14))  # of the stiffness at rest, added to a tangent that is indefinite
 _LEAST_JACOBIAN = 0.1  # in any cell of a state that cells are chosen by
 _EPSILONS = 8.0  # of machine precision, by which sums that cancel are off
@@ -433,6 +435,8 @@ class _Search:
         for start in self._expanded(factor):
             there = self._look(start)
             if there[0] < at_rest[0]:
+                if _norm(there[1]) > _FAST * self.size:
+                    return start, self._factor(start)[0], True, there
                 return start, factor, False, there
         return rest, factor, True, at_rest
 
@@ -447,7 +451,7 @@ class _Search:
 
     def found(self, near: GalerkinState | None) -> tuple[Floats, Floats]:
         """Coordinates of the state, and the factor of its tangent, which is positive definite."""
-        escapes = 0
+        escapes, secants = 0, list[Secant]()
         q, factor, is_fresh, (energy, missing) = self._begun(near)
         for _ in range(_ITERATIONS):
             left = _norm(missing)
@@ -458,12 +462,14 @@ class _Search:
                 q, (energy, missing) = self._off_the_saddle(q, energy)
                 escapes, is_fresh = escapes + 1, True
                 factor, _ = self._factor(q)
+                secants.clear()
                 if escapes > _ESCAPES:
                     break
                 continue
-            step = _solved(factor, missing)
+            step = _improved(factor, secants, missing)
             length, there = self._length(q, step, energy, missing)
             if length:
+                _remember(secants, length * step, missing - there[1])
                 q, (energy, missing) = q + length * step, there
             elif is_fresh:
                 break
@@ -471,6 +477,7 @@ class _Search:
             is_fresh = is_slow
             if is_slow:
                 factor, _ = self._factor(q)
+                secants.clear()
         raise NotConverged(
             f"GalerkinNetwork: no stable equilibrium was found; out-of-balance forces are {left / self.size:.1e} of "
             "the load's. The load may be too large: try a smaller one."
@@ -519,6 +526,28 @@ def _norm(vector: Floats) -> float:
 
 def _solved(factor: Floats, right: Floats) -> Floats:
     found: Floats = dpotrs(factor, right, lower=True)[0]
+    return found
+
+
+Secant = tuple[Floats, Floats, float]  # a step, by what forces changed on it, and one over their product
+
+
+def _remember(secants: list[Secant], step: Floats, change: Floats) -> None:
+    """Add what a step has told of the stiffness, where it is positive there."""
+    product = float(step @ change)
+    if product > 0.0:
+        secants.append((step, change, 1.0 / product))
+
+
+def _improved(factor: Floats, secants: list[Secant], missing: Floats) -> Floats:
+    """The step for out-of-balance forces by a tangent of before, brought up to date by secants (BFGS)."""
+    right, shares = missing.copy(), []
+    for step, change, inverse in reversed(secants):
+        shares.append(inverse * float(step @ right))
+        right -= shares[-1] * change
+    found = _solved(factor, right)
+    for (step, change, inverse), share in zip(secants, reversed(shares), strict=True):
+        found += (share - inverse * float(change @ found)) * step
     return found
 
 
