@@ -593,7 +593,7 @@ def demo(port: int | None, browser: bool, record: Path | None, seconds: float) -
 @flags(CloudArguments)
 @flags(StartArguments)
 @flags(RegistrationSection, ("model", "zone"), unset=True)
-@flags(WatchArguments, ("idle",))
+@flags(WatchArguments, ("idle", "learn", "keep"))
 @flags(PageArguments)
 def live(
     twin: Path,
@@ -604,6 +604,8 @@ def live(
     landmarks: tuple[Path, Path] | None,
     align: str | None,
     idle: float | None,
+    learn: bool,
+    keep: bool,
     port: int | None,
     browser: bool,
     **chosen: Any,
@@ -621,8 +623,8 @@ def live(
         raise ConfigError("--start, --landmarks, --align: expected one of them, got several.")
     begin = Start(start, landmarks or None, align is not None)
     run_live(
-        twin, parse_source(source), _given(chosen), unit=unit, axes=frame, start=begin, idle=idle, port=port,
-        browser=browser, say=click.echo,
+        twin, parse_source(source), _given(chosen), unit=unit, axes=frame, start=begin, idle=idle, learn=learn,
+        keep=keep, port=port, browser=browser, say=click.echo,
     )  # fmt: skip
 
 

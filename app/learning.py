@@ -112,7 +112,7 @@ class BackgroundLearner:
     def __init__(
         self, twin: Twin, *, seconds: float = 4.0, seed: int = 0, say: Callable[[str], None] = lambda line: None
     ) -> None:
-        _check(twin)
+        check(twin)
         self._twin, self._say = twin, say
         self._news = threading.Condition()
         self._waiting: deque[_Asked] = deque(maxlen=_WAITING)
@@ -285,7 +285,12 @@ class BackgroundLearner:
         self._say(str(self))
 
 
-def _check(twin: Twin) -> None:
+def check(twin: Twin) -> None:
+    """Refuse a twin that cannot learn.
+
+    Raises:
+        ConfigError: why it cannot.
+    """
     section, scenario = twin.config.registration, Scenario.of(twin.config)
     network = twin.network
     if section.parameters or scenario.patch is not None:

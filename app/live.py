@@ -156,8 +156,7 @@ def watch_source(
     """
     check_budget(budget)
     check_idle(idle)
-    if keep and not learn:
-        raise ConfigError("--keep: expected --learn beside it.")
+    check_keep(learn, keep)
     if isinstance(source, Address):
         unit, axes = unit or "mm", axes or "ras"
     elif source.exists() and not source.is_dir():
@@ -173,32 +172,66 @@ def watch_source(
     with scene.opened(start, say) as (twin, camera):
         say_coordinates(twin, say)
         twin.registrar()  # prepared before the first cloud is waited for
-        with _learning(twin, learn, say) as learner, opened(source, scene, twin, idle, say) as feed:
-            try:
-                rows = register_live(
-                    twin, feed.box, output, camera=camera, formats=formats or WRITTEN, budget=budget,
-                    frame_landmarks=frame_landmarks, reply=feed.reply, learner=learner, say=say,
-                )  # fmt: skip
-            finally:  # a watch ends by Ctrl-C as a rule
-                if learner is not None:
-                    say(str(learner))
-                    if keep:
-                        _keep(learner, scene.home.folder, say)
+        kept_in = scene.home.folder if keep else None
+        with learning(twin, learn, kept_in, say) as learner, opened(source, scene, twin, idle, say) as feed:
+            rows = register_live(
+                twin, feed.box, output, camera=camera, formats=formats or WRITTEN, budget=budget,
+                frame_landmarks=frame_landmarks, reply=feed.reply, learner=learner, say=say,
+            )  # fmt: skip
             say(keeping_up(rows))
             if told := feed.summary():
                 say(told)
     return counts(rows)
 
 
+def check_keep(learn: bool, keep: bool) -> None:
+    """Refuse to keep what is not learned.
+
+    Raises:
+        ConfigError: `--keep` alone.
+    """
+    if keep and not learn:
+        raise ConfigError("--keep: expected --learn beside it.")
+
+
+def check_learning(twin: Twin) -> None:
+    """Refuse a twin that cannot learn.
+
+    Raises:
+        ConfigError: why it cannot.
+    """
+    from .learning import check  # torch is needed here alone
+
+    check(twin)
+
+
 @contextmanager
-def _learning(twin: Twin, learn: bool, say: Callable[[str], None]) -> Iterator[BackgroundLearner | None]:
+def learning(
+    twin: Twin, learn: bool, kept_in: Path | None, say: Callable[[str], None]
+) -> Iterator[BackgroundLearner | None]:
+    """What adapts a twin's surrogate while frames come, and says in the end what it has learned.
+
+    Args:
+        twin: that registers.
+        learn: whether it learns; None is given if not.
+        kept_in: folder of the twin that keeps what was learned; None to throw it away.
+        say: prints a line.
+
+    Raises:
+        ConfigError: a twin that cannot learn, and why.
+    """
     if not learn:
         yield None
         return
     from .learning import BackgroundLearner  # torch is needed here alone
 
     with BackgroundLearner(twin, say=say) as learner:
-        yield learner
+        try:
+            yield learner
+        finally:  # frames end by Ctrl-C as a rule
+            say(str(learner))
+            if kept_in is not None:
+                _keep(learner, kept_in, say)
 
 
 def _keep(learner: BackgroundLearner, folder: Path, say: Callable[[str], None]) -> None:

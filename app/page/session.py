@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from softtwin.registration.result import Registration
 from ..record import pose_correction_of
 from ..register import registered
 from ..streams import Arrival, Mailbox, fed
-from ..twin import Camera, Frame, Home, Sequence, Twin
+from ..twin import Camera, Frame, Home, Learner, Sequence, Twin
 from .bands import SCALES
 from .brush import Brush
 from .camera import Shot
@@ -33,6 +33,8 @@ from .scene import Picture
 from .values import errors_of, margins_of, shown_values
 
 Floats = NDArray[np.float64]
+Learning = Callable[[Twin], AbstractContextManager[Learner | None]]
+LEARNERS = ("surrogate", "hybrid")  # engines whose surrogate can learn
 
 
 class Session:
@@ -45,6 +47,7 @@ class Session:
         options: entries of [registration] that replace the twin's.
         camera: where the camera stands; a simulated one that is misaligned is looked for near where it should be.
         engine: that registers to begin with; the first that this machine can run if not given.
+        learning: makes what adapts the surrogate of a twin that is opened while frames come; nothing does if not given.
     """
 
     def __init__(
@@ -55,7 +58,10 @@ class Session:
         options: Mapping[str, Any] | None = None,
         camera: Camera = None,
         engine: str = "",
+        learning: Learning | None = None,
     ) -> None:
+        self._learning = learning
+        self._learner: Learner | None = None
         self._server, self._home, self._options, self._camera = server, home, dict(options or {}), camera
         has_network = (home.folder / "surrogate.json").is_file()
         engines = sorted(engines_here(has_network), key=lambda name: name != engine)
@@ -174,7 +180,7 @@ class Session:
             self._kept[1].close()
         twin = self._kept[1].twin if same and self._kept is not None else self._opened(wishes.engine)
         camera = twin.near(Pose.identity()) if wishes.view.is_misaligned else self._camera
-        self._kept = wanted, Sequence(twin, None, camera, is_live=True)
+        self._kept = wanted, Sequence(twin, None, camera, is_live=True, learner=self._learner)
         self._answered.clear()
         return self._kept[1]
 
@@ -182,7 +188,11 @@ class Session:
         self.controls.show(Figures("registration", reason=f"the engine is being opened: {engine}", engine=engine))
         self._resources.close()
         self._figures = Figures("registration", engine=engine)
-        return self._resources.enter_context(self._home.twin(engine, **self._options))
+        twin = self._resources.enter_context(self._home.twin(engine, **self._options))
+        self._learner = None
+        if self._learning is not None and engine in LEARNERS:
+            self._learner = self._resources.enter_context(self._learning(twin))
+        return twin
 
     def _show(self, frame: Frame, shot: Shot, wishes: Wishes, twin: Twin) -> None:
         found, judgement = frame.registration, frame.judgement

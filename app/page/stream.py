@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +11,16 @@ from softtwin.meshes.io import Axes, Unit
 
 from ..address import Address
 from ..config import ConfigError
+from ..live import check_keep, check_learning, learning
 from ..record import NOTICE
 from ..register import Scene, Start
 from ..sources import check_idle, watched
 from ..streams import Cloud, Mailbox
-from ..twin import Camera, Home, find_twin
+from ..twin import Camera, Home, Learner, Twin, find_twin
 from .camera import Shot
 from .demo import run_until_interrupted
 from .server import address, open_browser, serving
-from .session import Session
+from .session import Learning, Session
 
 Say = Callable[[str], None]
 
@@ -65,6 +66,8 @@ def run_live(
     axes: Axes | None = None,
     start: Start | None = None,
     idle: float | None = None,
+    learn: bool = False,
+    keep: bool = False,
     port: int | None = None,
     browser: bool = True,
     say: Say = print,
@@ -79,6 +82,8 @@ def run_live(
         axes: of the clouds; if not given those of the twin's files, RAS for a peer.
         start: where the camera stands; in the body's coordinates if not given.
         idle: see `clouds_of`.
+        learn: adapt the surrogate in a second process while frames come.
+        keep: put what was learned into the twin at the end, and where the page changes to another engine.
         port: of the page; the first free one from 8080 on if not given.
         browser: open the page in a browser where there is a display.
         say: prints a line.
@@ -86,13 +91,19 @@ def run_live(
     Raises:
         ConfigError, FileError, PoseError, TwinError, LinkError: what cannot be used, and why.
     """
+    check_keep(learn, keep)
     if isinstance(source, Address):
         unit, axes = unit or "mm", axes or "ras"
     scene = Scene.of(place, options, unit, axes)
     clouds = clouds_of(source, scene, idle, say)
-    with scene.opened(start or Start(), say) as (_, camera):
-        pass
-    _show(scene.home, clouds, options, camera, port, browser, say)
+    with scene.opened(start or Start(), say) as (twin, camera):
+        if learn:
+            check_learning(twin)
+
+    def learner_of(twin: Twin) -> AbstractContextManager[Learner | None]:
+        return learning(twin, learn, scene.home.folder if keep else None, say)
+
+    _show(scene.home, clouds, options, camera, port, browser, say, learner_of if learn else None)
 
 
 def show(
@@ -129,12 +140,13 @@ def _show(
     port: int | None,
     browser: bool,
     say: Say,
+    learner_of: Learning | None = None,
 ) -> None:
     chosen = {name: value for name, value in options.items() if name != "model"}
     engine = str(options.get("model") or home.config.registration.model)
     with ExitStack() as stack:  # however early Ctrl-C comes: a thread at work when Python ends takes the process down
         server = stack.enter_context(serving(port, "softtwin live"))
-        session = Session(server, home, options=chosen, camera=camera, engine=engine)
+        session = Session(server, home, options=chosen, camera=camera, engine=engine, learning=learner_of)
         stack.enter_context(closing(session))
 
         def show() -> None:

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from softtwin.app.page.figures import Figures
 from softtwin.app.page.session import Session
 from softtwin.app.page.stream import clouds_of, run_live, show
 from softtwin.app.register import Scene
-from softtwin.app.twin import find_twin
+from softtwin.app.twin import Frame, Twin, find_twin
 from softtwin.registration.verdict import Verdict
 
 from .conftest import run
@@ -145,6 +146,74 @@ def test_another_engine_goes_on_where_the_first_was(told: list[Figures]) -> None
         session.run(slowly(session, switched(), told))
     assert [found.engine for found in answered(told)] == ["surrogate", "hybrid"]
     assert all(found.verdict is not Verdict.REFUSED for found in answered(told))
+
+
+class Noted:
+    """A learner that counts what it is asked for."""
+
+    def __init__(self) -> None:
+        self.calls = list[str]()
+
+    def renew(self) -> None:
+        self.calls.append("renew")
+
+    def tell(self, frame: Frame) -> None:
+        self.calls.append(f"tell {frame.judgement.verdict.value}")
+
+
+def test_a_page_learns_from_each_frame_with_each_engine_that_can(told: list[Figures]) -> None:
+    """The learner goes on where only the camera's pose is looked for anew, and ends with its engine."""
+    pytest.importorskip("dolfinx", reason="FEniCSx is absent")
+    learners, ended = list[Noted](), list[int]()
+
+    @contextmanager
+    def learning(twin: Twin) -> Iterator[Noted]:
+        learners.append(Noted())
+        yield learners[-1]
+        ended.append(len(answered(told)))
+
+    with page_server.serving() as server:
+        session = Session(server, find_twin(PHANTOM), is_simulated=True, learning=learning)
+
+        def switched() -> Iterator[Shot]:
+            for number, found in enumerate(shots(4)):
+                session.controls._sliders[2].value = (0.0, 4.0, 4.0, 4.0)[number]
+                session.controls._engine.value = ("surrogate", "surrogate", "reference", "hybrid")[number]
+                yield found
+
+        session.run(slowly(session, switched(), told))
+    assert [found.engine for found in answered(told)] == ["surrogate", "surrogate", "reference", "hybrid"]
+    assert [[call.split()[0] for call in each.calls] for each in learners] == [["renew", "tell"] * 2, ["renew", "tell"]]
+    assert ended == [2, 4]
+
+
+def test_a_page_says_what_it_learned_and_keeps_nothing_unasked(tmp_path: Path, told: list[Figures]) -> None:
+    np.save(tmp_path / "cloud_1.npy", next(shots(1)).cloud)
+    before, said = (PHANTOM / "surrogate.json").read_bytes(), list[str]()
+    run_live(PHANTOM, tmp_path, {}, idle=1.0, learn=True, browser=False, say=said.append)
+    assert answered(told)[-1].verdict is Verdict.ACCEPTED
+    assert any("learned" in line for line in said)
+    assert (PHANTOM / "surrogate.json").read_bytes() == before and not (PHANTOM / "as-built").exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "options", "message"),
+    [
+        ({"keep": True}, {}, r"--keep: expected --learn beside it"),
+        (
+            {"learn": True},
+            {"model": "torch"},
+            r"registration\.model: expected a twin that registers with its surrogate",
+        ),
+    ],
+)
+def test_what_cannot_be_learned_is_refused_before_the_page_opens(
+    tmp_path: Path, asked: dict[str, bool], options: dict[str, str], message: str
+) -> None:
+    said = list[str]()
+    with pytest.raises(ConfigError, match=message):
+        run_live(PHANTOM, tmp_path, options, browser=False, say=said.append, **asked)
+    assert not any("http://" in line for line in said)
 
 
 def test_clouds_of_a_peer_are_heard_in_its_own_unit_and_axes() -> None:
