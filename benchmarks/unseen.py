@@ -1,9 +1,10 @@
 """Organs that nothing was learned for: what predicts their states at once, and with 32 equilibria of their own.
 
-    python benchmarks/unseen.py [--organs 40] [--only family ...]
+    python benchmarks/unseen.py [--organs 40] [--blends 8] [--only family ...]
 
-Organs of a family (`meshes/family.py`; forms, supports, Poisson's ratios of 0.40 to 0.47) and others of no family: a
-kidney and a liver as another program wrote them, the real liver, a lung (`../shared/data`). Loads of the default kind,
+Organs of a family (`meshes/family.py`; forms, supports, Poisson's ratios of 0.40 to 0.47), blends of given organs (the
+phantom, a kidney, a liver, with supports and ratios of the family), and others of no family: a kidney and a liver as
+another program wrote them, the real liver, a lung (`../shared/data`). Loads of the default kind,
 scaled to 30 mm, and smooth ones on patches as registration expects them; truths by the reference. Errors are
 |u - u*| / |u*| over the nodes. Ways that learn nothing: the linear response, with its turns made finite (warped), the
 Galerkin model of linear modes alone, with modal derivatives, and with what 32 equilibria add; torch's solver, stopped
@@ -34,9 +35,10 @@ from summaries import median_seconds
 from softtwin.app.config import parse_config
 from softtwin.app.stages.mesh import mesh_stage
 from softtwin.app.workspace import Workspace
-from softtwin.meshes.body import Body
-from softtwin.meshes.family import member
+from softtwin.meshes.body import Body, Surface
+from softtwin.meshes.family import Member, blend, member
 from softtwin.meshes.io import read_body
+from softtwin.meshes.shapes import liver_phantom
 from softtwin.reference.data.dataset import DataSet, Samples, existing
 from softtwin.reference.data.samplers import LoadPlan
 from softtwin.reference.generate import Plan, generate
@@ -108,8 +110,20 @@ def organ_of(name: str) -> Organ:
     """By the name of a row."""
     if name in OTHERS:
         return OTHERS[name]()
-    found = member(int(name.split()[1]))
+    found = member_of(name)
     return Organ(found.body, found.young_modulus, found.poisson_ratio)
+
+
+def member_of(name: str) -> Member:
+    """An organ of the family by the name of a row."""
+    kind, number = name.split()
+    return member(int(number)) if kind == "family" else blend(int(number), given_organs())
+
+
+def given_organs() -> list[Surface]:
+    """Between which blends lie."""
+    found = [liver_phantom(0.012).boundary_surface]
+    return found + [meshed(name).boundary_surface for name in ("simulated kidney", "simulated liver")]
 
 
 def plan_of(organ: Organ) -> Plan:
@@ -186,7 +200,7 @@ def work(name: str, given: Given) -> dict[str, Any]:
     splits = {split: data.samples(split) for split in ("test", "smooth")}
     forces = {split: whole(data, samples) for split, samples in splits.items()}
     ways, bounds = {}, {}
-    learn = name in OTHERS or int(name.split()[1]) % given.learn_every == 0
+    learn = name in OTHERS or (name.startswith("family") and int(name.split()[1]) % given.learn_every == 0)
     for way, predict, seconds, surrogate in ways_of(data, learn):
         one = forces["test"][0]
         ways[way] = {
@@ -201,7 +215,7 @@ def work(name: str, given: Given) -> dict[str, Any]:
     found = {
         "nodes": len(data.body.points),
         "poisson_ratio": float(data.header["plan"]["poisson_ratio"]),
-        "form": "" if name in OTHERS else member(int(name.split()[1])).form,
+        "form": "" if name in OTHERS else member_of(name).form,
         "rejected": len(data.rejected().draws),
         "moved_mm": [round(1e3 * float(np.linalg.norm(u, axis=1).max()), 2) for u in splits["test"].displacements],
         "ways": ways,
@@ -214,13 +228,16 @@ def work(name: str, given: Given) -> dict[str, Any]:
 
 def rows_of(given: Given) -> list[str]:
     """Organs."""
-    return [*(f"family {number}" for number in range(given.organs)), *OTHERS]
+    counts = {"family": given.organs, "blend": given.blends}
+    made = (f"{kind} {number}" for kind, count in counts.items() for number in range(count))
+    return [*made, *OTHERS]
 
 
 def summarised(figures: Figures, given: Given | None = None) -> Figures:
     """Organs of the family together, others one by one: of each way, errors in percent, pooled over organs."""
     organs = figures["organs"]
-    groups = {"family": [row for name, row in organs.items() if name.startswith("family")]}
+    groups = {kind: [row for name, row in organs.items() if name.startswith(kind)] for kind in ("family", "blend")}
+    groups = {kind: rows for kind, rows in groups.items() if rows}
     groups |= {name: [organs[name]] for name in OTHERS if name in organs}
     found: Figures = {}
     for group, rows in groups.items():
@@ -263,12 +280,13 @@ BENCHMARK = Benchmark(
     ),
     settings={
         "organs": Setting(40, "of the family", picks=True),
+        "blends": Setting(8, "of given organs", picks=True),
         "learn_every": Setting(8, "organ of the family, that a network is trained for, too", picks=True),
         "keep": Setting(False, "keep equilibria of the family", picks=True),
         "ranks": RANKS,
     },
     seeds=(0,),
-    small={"organs": 1},
+    small={"organs": 1, "blends": 0},
     under="organs",
     finish=summarised,
     lines=lines,

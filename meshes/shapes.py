@@ -144,12 +144,12 @@ def liver_phantom(cell_size: float = 0.0095) -> Body:
     """
     if not 0.002 <= cell_size <= 0.02:
         raise ValueError(f"cell_size: expected 0.002 to 0.02 m for the liver phantom, got {cell_size}.")
-    outline = _isosurface(_liver, (-0.115, -0.085, -0.095), (0.12, 0.085, 0.085), spacing=0.004)
+    outline = isosurface(_liver, (-0.115, -0.085, -0.095), (0.12, 0.085, 0.085), spacing=0.004)
     points, cells = filled(outline, cell_size)
     inner = {
         "vessel_portal": _vessel(_PORTAL),
         "vessel_hepatic": _vessel(_HEPATIC),
-        "tumour": _isosurface(_tumour, _TUMOUR - 0.018, _TUMOUR + 0.018, spacing=0.002),
+        "tumour": isosurface(_tumour, _TUMOUR - 0.018, _TUMOUR + 0.018, spacing=0.002),
     }
     return _held_at_hilum(points, cells, inner)
 
@@ -182,7 +182,7 @@ def _tumour(x: Floats) -> Floats:
 
 def _vessel(branches: Sequence[_Branch]) -> Surface:
     ends = np.array([[start, end] for start, end, *_ in branches]).reshape(-1, 3)
-    return _isosurface(lambda x: _tree(x, branches), ends.min(axis=0) - 0.01, ends.max(axis=0) + 0.01, spacing=0.0015)
+    return isosurface(lambda x: _tree(x, branches), ends.min(axis=0) - 0.01, ends.max(axis=0) + 0.01, spacing=0.0015)
 
 
 def _tree(x: Floats, branches: Sequence[_Branch]) -> Floats:
@@ -219,9 +219,17 @@ def _smooth_cut(a: Floats, b: Floats, width: float) -> Floats:
     return -_smooth_union(-a, b, width)
 
 
-def _isosurface(
+def isosurface(
     function: Callable[[Floats], Floats], low: Sequence[float] | Floats, high: Sequence[float] | Floats, spacing: float
 ) -> Surface:
+    """The surface on which a function of places is zero, wound outward from where it is negative.
+
+    Args:
+        function: of places (..., 3), metres: (...,).
+        low: corner of the grid, (3,), metres.
+        high: the opposite one.
+        spacing: of the grid, metres.
+    """
     # Off round numbers, since where the function is zero at a grid point, triangles shrink to nothing.
     low, high = np.asarray(low, float) - 0.317 * spacing, np.asarray(high, float)
     counts = np.ceil((high - low) / spacing).astype(int) + 1

@@ -233,13 +233,14 @@ def _node_estimate(surface: Surface, cell_size: float) -> float:
     return abs(surface.volume) * _NODES_IN_CUBE / cell_size**3 + surface.area * _NODES_ON_SQUARE / cell_size**2
 
 
-def _size_estimate(surface: Surface, node_count: int) -> float:
+def size_estimate(surface: Surface, node_count: float) -> float:
+    """The edge length, metres, of cells that fill a surface with about so many nodes."""
     roots = np.roots([node_count, 0.0, -surface.area * _NODES_ON_SQUARE, -abs(surface.volume) * _NODES_IN_CUBE])
     return float(roots[np.isreal(roots)].real.max())
 
 
 def _search_size(surface: Surface, node_count: int) -> tuple[Floats, Ints]:
-    size, found = _size_estimate(surface, node_count), dict[float, tuple[Floats, Ints]]()
+    size, found = size_estimate(surface, node_count), dict[float, tuple[Floats, Ints]]()
     for _ in range(_SEARCHES):
         found[size] = _filled(surface, size)
         count = len(found[size][0])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softtwin.meshes.family import member
+from softtwin.meshes.body import Body, Surface
+from softtwin.meshes.family import blend, member
 from softtwin.meshes.metrics import mesh_quality
 
 
@@ -50,3 +51,48 @@ def test_what_is_no_member_is_refused() -> None:
         member(-1)
     with pytest.raises(ValueError, match=r"member\.nodes: expected at least 100, got 20"):
         member(1, nodes=20)
+
+
+def test_tumours_are_stiffer_balls_of_cells() -> None:
+    found = [member(number) for number in range(24)]
+    assert {len(each.tumours) for each in found} == {0, 1, 2}
+    for each in found:
+        moduli, middles = each.young_moduli, each.body.points[each.body.cells].mean(axis=1)
+        inside = np.zeros(len(moduli), dtype=bool)
+        for tumour in each.tumours:
+            inside[tumour.cells] = True
+            assert len(tumour.cells) and 2.0 <= tumour.stiffness <= 10.0 and tumour.radius <= 0.02
+            off = np.linalg.norm(middles - tumour.centre, axis=1)
+            assert off[tumour.cells].max() <= tumour.radius < np.delete(off, tumour.cells).min()
+        np.testing.assert_allclose(moduli[~inside], each.young_modulus)
+        assert (moduli[inside] >= 1.99 * each.young_modulus).all()
+
+
+def test_blends_lie_between_given_surfaces() -> None:
+    """Sound, each the same for its number, and as large as one would expect between the two."""
+    pytest.importorskip("gmsh", reason="gmsh is absent")
+    pytest.importorskip("pyacvd", reason="pyacvd is absent")
+    organs = [outside(member(number).body) for number in (0, 1, 2)]
+    volumes = [each.volume for each in organs]
+    for number in range(4):
+        found = blend(number, organs, nodes=500)
+        quality = mesh_quality(found.body)
+        assert found.form == "blend" and quality.min_scaled_jacobian > 0.0
+        assert 300 <= len(found.body.points) <= 900
+        assert 0.6 * min(volumes) < found.body.volume < 1.4 * max(volumes)
+        assert 0.04 <= len(found.body.fixed) / len(found.body.boundary_nodes) <= 0.26
+    again = blend(3, organs, nodes=500)
+    assert np.array_equal(again.body.points, found.body.points) and again.young_modulus == found.young_modulus
+
+
+def outside(body: Body) -> Surface:
+    vertices, local = np.unique(body.boundary, return_inverse=True)
+    return Surface(body.points[vertices], local.reshape(-1, 3))
+
+
+def test_what_is_no_blend_is_refused() -> None:
+    one = outside(member(0).body)
+    with pytest.raises(ValueError, match=r"blend\.surfaces: expected at least two, got 1"):
+        blend(0, [one])
+    with pytest.raises(ValueError, match=r"blend\.number: expected 0 or more, got -2"):
+        blend(-2, [one, one])
