@@ -45,8 +45,7 @@ def export_draws(data: DataSet, draws: Sequence[int], folder: Path) -> list[Path
         reason = Reason(row["reason"][0])
         if reason is not Reason.ACCEPTED:
             raise DataSetError(f"data.draws: expected a draw that was accepted, got {draw}: {reason.words}.")
-        forces = np.zeros_like(data.body.points)
-        forces[data.response.loaded] = row["forces"][0]
+        forces = data.response.spread(row["forces"][0])
         path = folder / f"draw-{draw:06d}.vtu"
         write_deformed(path, data.body, row["displacements"][0], {"force": forces})
         written += [path, *_pictured(data.body, row["displacements"][0], path.with_suffix(".png"))]

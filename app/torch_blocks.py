@@ -182,8 +182,7 @@ def agreement(data: DataSet, draws: list[int], share: float = CHECKED) -> dict[s
     with Problem(data.body, plan.build_material(), plan.newton, springs=plan.springs) as problem:
         for draw in chosen:
             rows = data.rows(range(draw, draw + 1))
-            forces = np.zeros_like(data.body.points)
-            forces[data.response.loaded] = rows["forces"][0]
+            forces = data.response.spread(rows["forces"][0])
             try:
                 truth = problem.solve(forces).displacement
             except NotConverged:

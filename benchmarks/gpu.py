@@ -159,9 +159,7 @@ def environment(data: DataSet, device: str) -> dict[str, Any]:
 
 def whole(data: DataSet, forces: Floats) -> torch.Tensor:
     """Forces at the loaded nodes, (s, l, 3), as forces at all, (s, n, 3)."""
-    out = np.zeros((len(forces), *data.body.points.shape))
-    out[:, data.response.loaded] = forces
-    return torch.from_numpy(out)
+    return torch.from_numpy(data.response.spread(forces))
 
 
 def equilibria(data: DataSet, device: str, few: int | None) -> dict[str, Any]:
@@ -343,8 +341,7 @@ def latency(task: Callable[[], Any], calls: int) -> dict[str, float]:
 def prediction(surrogate: Surrogate, data: DataSet, device: Any, calls: int, large: bool) -> dict[str, Any]:
     """Errors on the test split by the device, how far they are from the processor's in double, and times."""
     samples = data.samples("test")
-    forces = np.zeros((len(samples), *data.body.points.shape))
-    forces[:, data.response.loaded] = samples.forces
+    forces = data.response.spread(samples.forces)
     batch = np.resize(forces, (BATCH, *forces.shape[1:]))
     found: dict[str, Any] = {}
     few = 2 if large else min(16, len(forces))

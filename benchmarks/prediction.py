@@ -123,8 +123,7 @@ def measured(
     """All figures of one network."""
     surrogate = surrogate_of(architecture, data)
     samples = data.samples("test")
-    loads = np.zeros((max(BATCHES), *data.body.points.shape))
-    loads[:, data.response.loaded] = np.resize(samples.forces, (max(BATCHES), *samples.forces.shape[1:]))
+    loads = data.response.spread(np.resize(samples.forces, (max(BATCHES), *samples.forces.shape[1:])))
     fast = FastSurrogate(surrogate, device)  # type: ignore[arg-type]
     coefficients = np.full(fast.directions.shape[1], 1e-3)
     operations, size = counted(surrogate)

@@ -155,9 +155,7 @@ def data_of(name: str, ranks: int) -> DataSet:
 
 def whole(data: DataSet, samples: Samples) -> Floats:
     """Forces at all nodes, (s, n, 3)."""
-    forces = np.zeros((len(samples), *data.body.points.shape))
-    forces[:, data.response.loaded] = samples.forces
-    return forces
+    return data.response.spread(samples.forces)
 
 
 def ways_of(data: DataSet, learn: bool) -> Iterable[tuple[str, Callable[[Floats], Floats], float, Surrogate | None]]:

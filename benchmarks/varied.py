@@ -53,8 +53,7 @@ def cases_of(folder: Any, count: int, is_stiffer: bool) -> list[Case]:
         moduli = np.full(len(data.body.cells), RANGES["young-modulus@tumour"][0])
         if is_stiffer:
             moduli[inside] = float(np.exp(rng.uniform(*np.log(RANGES["young-modulus@tumour"]))))
-        forces = np.zeros_like(data.body.points)
-        forces[data.response.loaded] = loads[number % len(loads)]
+        forces = data.response.spread(loads[number % len(loads)])
         state = Equilibria(data.body, NeoHookean(moduli, ratio)).solve(forces[None])
         if bool(state.is_converged[0] & state.is_stable[0]):
             tissue = {"poisson_ratio": ratio, "young_modulus": moduli}
@@ -70,9 +69,7 @@ def own_cases(folder: Any, count: int) -> list[Case]:
     samples = data.samples("train")
     found: list[Case] = []
     for loads, displacement in list(zip(samples.forces, samples.displacements, strict=True))[OWN : OWN + count]:
-        forces = np.zeros_like(data.body.points)
-        forces[data.response.loaded] = loads
-        found.append(({}, forces, displacement))
+        found.append(({}, data.response.spread(loads), displacement))
     return found
 
 

@@ -60,8 +60,7 @@ def cases_of(data: DataSet) -> dict[str, list[Case]]:
     solver, samples = Equilibria(data.body, data.material, springs=data.springs), data.samples("test")
     own, others = list[Case](), list[Case]()
     for number, (loads, displacement) in enumerate(zip(samples.forces, samples.displacements, strict=True)):
-        forces = np.zeros_like(data.body.points)
-        forces[data.response.loaded] = loads
+        forces = data.response.spread(loads)
         own.append((1.0, forces, displacement))
         factor = float(np.exp(np.random.default_rng([43, number]).uniform(*np.log(RANGE))))
         state = solver.with_springs({"bed": factor}).solve(forces[None])

@@ -196,8 +196,7 @@ def _difference(
     """
     rng, place = np.random.default_rng([seed, draw]), draw % len(samples)
     body, known = data.body, samples.displacements[place]
-    forces = np.zeros_like(body.points)
-    forces[data.response.loaded] = samples.forces[place]
+    forces = data.response.spread(samples.forces[place])
     translation = ensemble.attachment * rng.standard_normal(3) if ensemble.attachment else np.zeros(3)
     carrier = None
     if others:

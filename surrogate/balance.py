@@ -97,8 +97,7 @@ def balance(
 
 def predictions(surrogate: Surrogate, data: DataSet, samples: Samples) -> tuple[Floats, Floats]:
     """Nodal forces and predicted displacements of samples, (s, n, 3) each."""
-    forces = np.zeros((len(samples), *data.body.points.shape))
-    forces[:, data.response.loaded] = samples.forces
+    forces = data.response.spread(samples.forces)
     return forces, np.stack([surrogate.solve(one).displacement for one in forces])
 
 

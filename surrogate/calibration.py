@@ -165,9 +165,8 @@ def read_samples(reader: IndicatorReader, data: DataSet, samples: Samples, newto
         samples: of it.
         newton: so many of them, the first, with a step of Newton's method each.
     """
-    forces, shown, found = np.zeros_like(data.body.points), [], np.empty_like(samples.displacements)
-    for i, load in enumerate(samples.forces):
-        forces[data.response.loaded] = load
+    shown, found = [], np.empty_like(samples.displacements)
+    for i, forces in enumerate(data.response.spread(samples.forces)):
         state = reader.surrogate.solve(forces)
         shown.append(reader.read(forces, state, i < newton))
         found[i] = state.displacement

@@ -30,10 +30,8 @@ def relative_errors(surrogate: Surrogate, data: DataSet, samples: Samples) -> Fl
         data: the data set that the samples are of.
         samples: loads and displacements.
     """
-    forces = np.zeros_like(data.body.points)
-    missing = np.empty((len(samples), data.body.points.size))
-    for i, (loads, displacement) in enumerate(zip(samples.forces, samples.displacements, strict=True)):
-        forces[data.response.loaded] = loads
+    missing, every = np.empty((len(samples), data.body.points.size)), data.response.spread(samples.forces)
+    for i, (forces, displacement) in enumerate(zip(every, samples.displacements, strict=True)):
         size = np.linalg.norm(displacement, axis=1).max()
         missing[i] = (displacement - surrogate.solve(forces).displacement).ravel() / max(size, 1e-12)
     return missing
@@ -64,10 +62,8 @@ def smooth_errors(surrogate: Surrogate, data: DataSet) -> Floats:
     if not data.header["samples"].get("smooth"):
         return np.zeros((0, data.body.points.size))
     samples = data.samples("smooth")
-    forces = np.zeros_like(data.body.points)
     inside = np.zeros(len(samples), dtype=np.bool_)
-    for i, loads in enumerate(samples.forces):
-        forces[data.response.loaded] = loads
+    for i, forces in enumerate(data.response.spread(samples.forces)):
         inside[i] = (surrogate.solve(forces).extrapolation_ratio or 0.0) <= 1.0
     return relative_errors(surrogate, data, samples)[inside]
 

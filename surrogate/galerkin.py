@@ -400,9 +400,7 @@ def _law_of(data: DataSet) -> str:
 
 def _spread(data: DataSet, forces: Floats) -> Floats:
     """Forces at all nodes, (m, 3n)."""
-    whole = np.zeros((len(forces), len(data.body.points), 3))
-    whole[:, data.response.loaded] = forces
-    return whole.reshape(len(forces), -1)
+    return data.response.spread(forces).reshape(len(forces), -1)
 
 
 def _sketched(parts: Iterable[Singles], size: int) -> Singles:

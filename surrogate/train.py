@@ -101,9 +101,7 @@ def _fitted(
 
 
 def _predicted(surrogate: Surrogate, data: DataSet, samples: Samples) -> Any:
-    forces = np.zeros((len(samples), *data.body.points.shape))
-    forces[:, data.response.loaded] = samples.forces
-    return np.stack([surrogate.solve(load).displacement for load in forces])
+    return np.stack([surrogate.solve(load).displacement for load in data.response.spread(samples.forces)])
 
 
 def _check_split(data: DataSet, name: str, samples: Samples) -> None:

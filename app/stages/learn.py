@@ -108,9 +108,7 @@ def _write_predictions(space: Workspace, surrogate: Surrogate, data: DataSet) ->
     """Errors of all held-out samples, and the fields of the median and the worst, for the report."""
     samples = data.samples("test")
     predicted = np.zeros_like(samples.displacements)
-    for i, loads in enumerate(samples.forces):
-        forces = np.zeros_like(data.body.points)
-        forces[data.response.loaded] = loads
+    for i, forces in enumerate(data.response.spread(samples.forces)):
         predicted[i] = surrogate.solve(forces).displacement
     errors = nodal_distances(predicted, samples.displacements).mean(axis=1)
     order = np.argsort(errors)

@@ -55,6 +55,12 @@ class LinearResponse:
         flat = forces.reshape(len(forces), -1)
         return (flat @ self.right.T @ self.left.T).reshape(len(forces), -1, 3)
 
+    def spread(self, forces: Floats) -> Floats:
+        """Forces at all nodes, (..., n, 3), for those at the loaded nodes, (..., l, 3)."""
+        whole = np.zeros((*forces.shape[:-2], len(self.left) // 3, 3))
+        whole[..., self.loaded, :] = forces
+        return whole
+
 
 @dataclass(frozen=True, eq=False)
 class Samples:
