@@ -258,9 +258,8 @@ class Evidence:
         if key not in self._known:
             root = np.exp(0.5 * logs)
             matrix, projection = self._scaled(np.exp(-noise), root)
-            factor, failed = dpotrf(
-                matrix.T, lower=True, clean=False, overwrite_a=True
-            )  # by columns: nothing is copied
+            # By columns: nothing is copied.
+            factor, failed = dpotrf(matrix.T, lower=True, clean=False, overwrite_a=True)
             law = None if failed else Conditional(root, factor, dpotrs(factor, projection, lower=True)[0])
             self._known[key] = law
         return self._known[key]
@@ -319,6 +318,9 @@ class Evidence:
                 best = hyperprior.within(best)
         if not np.isfinite(lowest):
             raise ArithmeticError("Evidence.maximum: the evidence is finite at none of the starts.")
+        there = self.conditional(best)
+        self._known.clear()  # of a result that is kept only this is asked for again
+        self._known[best.tobytes()] = there
         return best
 
     def covariance(self, eta: Floats) -> Floats:

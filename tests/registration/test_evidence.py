@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
-from softtwin.registration.evidence import Evidence, Hyperprior, LinearProblem
+from softtwin.registration.evidence import Evidence, Hyperprior, LinearProblem, _descended
 from softtwin.registration.hyperparameters import LogNormalPrior
 
 POINTS, FORCES, PATTERNS = 300, 8, 6
@@ -184,3 +185,44 @@ def test_no_doubt_is_wider_than_what_was_believed(rng: np.random.Generator) -> N
     evidence = Drawn(rng, np.log([0.3, 2.0, 0.2])).evidence
     found = evidence.covariance(evidence.maximum([np.log([0.3, 2.0, 0.2])]))
     assert (np.diag(found) <= np.square(evidence.hyperprior.spread) + 1e-12).all() and (np.diag(found) > 0.0).all()
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_the_descent_ends_where_a_librarys_does(number: int) -> None:
+    """Within bounds that hold some, on costs that bend differently from place to place."""
+    rng = np.random.default_rng(number)
+    size = int(rng.integers(1, 6))
+    root, middle = rng.standard_normal((size, size)), 3.0 * rng.standard_normal(size)
+    bend = 0.3 * np.eye(size) + root @ root.T / size
+
+    def cost(place: np.ndarray) -> tuple[float, np.ndarray]:
+        off = place - middle
+        value = 0.5 * off @ bend @ off + np.cosh(0.3 * off).sum()
+        return float(value), bend @ off + 0.3 * np.sinh(0.3 * off)
+
+    low, high = -rng.uniform(0.0, 4.0, size), rng.uniform(0.0, 4.0, size)
+    value, place = _descended(cost, cost(np.zeros(size)), low, high)
+    bounds = list(zip(low, high, strict=True))
+    wanted = minimize(cost, np.zeros(size), jac=True, method="L-BFGS-B", bounds=bounds, options={"gtol": 1e-9})
+    assert (place >= low).all() and (place <= high).all() and value == cost(place)[0]
+    assert value <= wanted.fun + 0.05  # a slope of a tenth is left at most
+
+
+def test_a_descent_steps_back_from_where_there_is_no_cost() -> None:
+    def cost(place: np.ndarray) -> tuple[float, np.ndarray]:
+        x = float(place[0])
+        return (np.inf, np.zeros(1)) if x >= 1.0 else (float(-np.log(1.0 - x) - 3.0 * x), np.array([1 / (1 - x) - 3]))
+
+    value, place = _descended(cost, cost(np.zeros(1)), np.array([-9.0]), np.array([9.0]))
+    assert place[0] == pytest.approx(2.0 / 3.0, abs=0.02) and np.isfinite(value)
+
+
+def test_of_a_result_that_is_kept_one_law_is_kept(rng) -> None:
+    evidence = Drawn(rng, np.log([0.3, 2.0, 0.2])).evidence
+    found = evidence.maximum([np.log([1.0, 1.0, 1.0])])
+    assert list(evidence._known) == [found.tobytes()]
+    law = evidence.conditional(found)
+    assert law is not None
+    np.testing.assert_allclose(law.inverse @ evidence.scaled(found), np.eye(len(law.root)), atol=1e-9)
+    change = rng.standard_normal(len(law.root))
+    np.testing.assert_allclose(law.square(change), change @ np.linalg.solve(law.covariance, change), rtol=1e-9)
