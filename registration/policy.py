@@ -193,7 +193,7 @@ class Accuracy:
     """How closely, or how much of it: with more, answers stay what they were, and time changes."""
 
     settled: float = choice(
-        0.2, "posterior deviations a coefficient", "the search has ended where so much is left after one more step"
+        0.1, "posterior deviations a coefficient", "the search has ended where so much is left after one more step"
     )
     enough: float = choice(
         0.3,
