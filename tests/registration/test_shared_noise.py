@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from softtwin.meshes.body import Body
+from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.hyperparameters import LogNormalPrior
 from softtwin.registration.lbfgs import LBFGS
@@ -41,9 +42,9 @@ def shaken(cloud: np.ndarray, rng: np.random.Generator, size: float = SIZE) -> n
     return cloud + size * field(cloud, LENGTH, rng) + OWN * rng.standard_normal(cloud.shape)
 
 
-def registrar(body: Body, pose: PosePrior | None = None) -> Registrar:
+def registrar(body: Body, pose: PosePrior | None = None, solver: GaussNewton | None = None) -> Registrar:
     forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 0.5, minimum=1e-4))
-    options = RegistrationOptions(localisation=SparseLocalisation(rounds=0))
+    options = RegistrationOptions(localisation=SparseLocalisation(rounds=0), solver=solver or GaussNewton())
     return Registrar(Cantilever(body), SurfaceDistance(body, body.surfaces["observed"]), forces, options, pose=pose)
 
 
@@ -134,10 +135,11 @@ def test_l_bfgs_finds_it_too(body: Body, rng: np.random.Generator) -> None:
 
 
 def test_the_exact_model_goes_on_with_what_the_fast_one_has_told(body: Body, rng: np.random.Generator) -> None:
-    both, last = HybridRegistrar(registrar(body), registrar(body)), None
+    fast, exact = (registrar(body, solver=GaussNewton(settled=0.02)) for _ in range(2))  # each far down its valley
+    both, last = HybridRegistrar(fast, exact), None
     for _ in range(2):
         last = both.follow(shaken(cloud_on(body, truth(body), 400, rng), rng), last)
         assert last.draft is not None and last.shared_noise is not None
         assert last.shared_noise == pytest.approx(last.draft.shared_noise, rel=0.2)
-    apart = (last.displacement - last.draft.displacement)[:, 1:]  # along itself the beam slides
-    assert np.linalg.norm(apart, axis=1).mean() < SIZE  # it is the same model
+    apart = np.linalg.norm(last.displacement - last.draft.displacement, axis=1)
+    assert apart.mean() < 0.1 * SIZE  # it is the same model
