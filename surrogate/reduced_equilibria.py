@@ -20,6 +20,7 @@ from torch import Tensor
 
 from softtwin.reference.data.materials import MATERIALS, Material
 from softtwin.reference.data.outcome import NotConverged
+from softtwin.reference.data.secants import Secants
 
 from .algebra import TorchAlgebra
 from .architecture import Linearisation, Network
@@ -451,7 +452,7 @@ class _Search:
 
     def found(self, near: GalerkinState | None) -> tuple[Floats, Floats]:
         """Coordinates of the state, and the factor of its tangent, which is positive definite."""
-        escapes, secants = 0, list[Secant]()
+        escapes, secants = 0, Secants(np.dot)
         q, factor, is_fresh, (energy, missing) = self._begun(near)
         for _ in range(_ITERATIONS):
             left = _norm(missing)
@@ -466,10 +467,9 @@ class _Search:
                 if escapes > _ESCAPES:
                     break
                 continue
-            step = _improved(factor, secants, missing)
+            step = -secants.improved(q, -missing, -_solved(factor, missing), 0)
             length, there = self._length(q, step, energy, missing)
             if length:
-                _remember(secants, length * step, missing - there[1])
                 q, (energy, missing) = q + length * step, there
             elif is_fresh:
                 break
@@ -526,28 +526,6 @@ def _norm(vector: Floats) -> float:
 
 def _solved(factor: Floats, right: Floats) -> Floats:
     found: Floats = dpotrs(factor, right, lower=True)[0]
-    return found
-
-
-Secant = tuple[Floats, Floats, float]  # a step, by what forces changed on it, and one over their product
-
-
-def _remember(secants: list[Secant], step: Floats, change: Floats) -> None:
-    """Add what a step has told of the stiffness, where it is positive there."""
-    product = float(step @ change)
-    if product > 0.0:
-        secants.append((step, change, 1.0 / product))
-
-
-def _improved(factor: Floats, secants: list[Secant], missing: Floats) -> Floats:
-    """The step for out-of-balance forces by a tangent of before, brought up to date by secants (BFGS)."""
-    right, shares = missing.copy(), []
-    for step, change, inverse in reversed(secants):
-        shares.append(inverse * float(step @ right))
-        right -= shares[-1] * change
-    found = _solved(factor, right)
-    for (step, change, inverse), share in zip(secants, reversed(shares), strict=True):
-        found += (share - inverse * float(change @ found)) * step
     return found
 
 

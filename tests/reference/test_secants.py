@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 
-from softtwin.reference.solve.newton import Secants
+from softtwin.reference.data.secants import Secants
 
 Floats = np.ndarray
 
@@ -59,3 +59,18 @@ def test_steps_along_which_the_energy_curves_down_teach_nothing() -> None:
     for point in (np.array([1.0, 2.0, 3.0]), np.array([2.0, 1.0, 0.0])):
         gap = down @ point
         np.testing.assert_array_equal(secants.improved(point, gap, gap.copy(), 0), gap)
+
+
+def test_a_tangent_of_before_is_brought_up_to_date() -> None:
+    """What the last step has told holds exactly, and all of it makes steps better."""
+    rng = np.random.default_rng(4)
+    root = rng.standard_normal((6, 6))
+    true, secants, wanted, at = np.eye(6) + 0.3 * root @ root.T, Secants(dot), rng.standard_normal(6), np.zeros(6)
+    before = np.linalg.norm(true @ wanted - wanted)
+    for step in rng.standard_normal((8, 6)):
+        secants.improved(at, true @ at, true @ at, 0)
+        moved = at + step
+        found = secants.improved(moved, true @ moved, true @ moved, 0) - secants.improved(at, true @ at, true @ at, 0)
+        np.testing.assert_allclose(found, step, rtol=1e-8, atol=1e-8)
+        at = moved
+    assert np.linalg.norm(true @ secants.improved(at, wanted, wanted, 0) - wanted) < 0.5 * before

@@ -34,7 +34,7 @@ from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.physics import Physics
 from softtwin.surrogate.plan import TrainingPlan
 from softtwin.surrogate.reduced import Reduced
-from softtwin.surrogate.reduced_equilibria import GalerkinNetwork, Secant, _improved, _remember, _Search
+from softtwin.surrogate.reduced_equilibria import GalerkinNetwork, _Search
 from softtwin.surrogate.residual import ElasticBody
 from softtwin.surrogate.train import train
 from softtwin.surrogate.twin import load, save
@@ -542,19 +542,3 @@ def test_a_tissue_that_it_cannot_be_is_refused(varied: tuple[DataSet, Surrogate]
         train(data, TrainingPlan(replace(SMALL, vary={"young-modulus@nothing": (1e3, 1e4)})))
     with pytest.raises(ValueError, match=r"expected springs@ one of \[\], got 'springs@bed'"):
         train(data, TrainingPlan(replace(SMALL, vary={"springs@bed": (0.5, 2.0)})))
-
-
-def test_a_tangent_of_before_is_brought_up_to_date_by_secants(rng) -> None:
-    """What the last step has told holds exactly, and all of it makes steps better; what is not positive is left out."""
-    root = rng.standard_normal((6, 6))
-    stale, true = np.eye(6), np.eye(6) + 0.3 * root @ root.T
-    factor, secants = np.linalg.cholesky(stale), list[Secant]()
-    wanted = rng.standard_normal(6)
-    before = np.linalg.norm(true @ _improved(factor, secants, wanted) - wanted)
-    for step in rng.standard_normal((8, 6)):
-        _remember(secants, step, true @ step)
-        np.testing.assert_allclose(_improved(factor, secants, true @ step), step, rtol=1e-9, atol=1e-9)
-    assert np.linalg.norm(true @ _improved(factor, secants, wanted) - wanted) < 0.5 * before
-    count = len(secants)
-    _remember(secants, step, -true @ step)
-    assert len(secants) == count
