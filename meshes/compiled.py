@@ -1,6 +1,6 @@
 """Loops that are compiled by numba, where that is installed: the extra `app` brings it, `register` leaves it out.
 
-numba takes 210 MB. What has loops for it has another way, too, for machines that only register and stay small.
+numba brings a compiler. What has loops for it has another way, too, for machines that only register and stay small.
 """
 
 from __future__ import annotations

@@ -33,9 +33,7 @@ _DIFFERENCE = 1e-2  # of the linear response: a step of a central difference of 
 _ITERATIONS, _ESCAPES = 200, 3  # of Newton's method; from balanced states that are not stable
 _DESCENT = 1e-4  # of what the slope promises
 _SHORTEST = 1e-6
-_FAST = (
-    0.4  # by which out-of-balance forces are to fall in a step, or the tangent is made anew: that costs five of these
-)
+_FAST = 0.4  # by which out-of-balance forces are to fall in a step, or the tangent is made anew
 _SHIFTS = tuple(1e-3 * 4.0**i for i in range(14))  # of the stiffness at rest, added to a tangent that is indefinite
 _LEAST_JACOBIAN = 0.1  # in any cell of a state that cells are chosen by
 _EPSILONS = 8.0  # of machine precision, by which sums that cancel are off
