@@ -15,6 +15,7 @@ from .compiled import IS_COMPILED, compiled
 _LEAF = 2  # triangles in a box that is not parted any further
 _DEEPEST = 64  # boxes inside each other: each holds half of the triangles of the one around it
 _TINY = 1e-300  # an edge without length divides by it
+_NOWHERE = np.zeros(0, dtype=np.int64)
 
 
 class TriangleTree:
@@ -34,21 +35,79 @@ class TriangleTree:
         self.triangles = np.ascontiguousarray(triangles, dtype=np.int64)
         if IS_COMPILED:
             self._order, self._parts, self._children = _tree(points[self.triangles].mean(axis=1))
+            self._places, self._ordered = np.argsort(self._order), self.triangles[self._order]
 
-    def closest(self, positions: Floats, cloud: Floats) -> tuple[Ints, Floats]:
+    def closest(self, positions: Floats, cloud: Floats, near: Ints | None = None) -> tuple[Ints, Floats]:
         """Triangle, (p,), and barycentric weights, (p, 3), of the closest point on the surface for each of a cloud.
 
         Args:
             positions: where the vertices are now, (v, 3), metres.
             cloud: points, (p, 3), metres.
+            near: a triangle for each point, (p,): where it is near, the search ends sooner.
         """
         if not IS_COMPILED:
             found = closest_points(Surface(positions, self.triangles), cloud)[1]
             return found, closest_in_triangles(positions[self.triangles[found]], cloud)[0]
-        corners = positions[self.triangles[self._order]]
+        corners = positions[self._ordered]
         boxes = _boxes(corners, self._parts, self._children)
-        found, weights = _closest(corners, self._parts, self._children, boxes, np.ascontiguousarray(cloud))
+        begun = _NOWHERE if near is None else self._places[near]
+        found, weights = _closest(corners, self._parts, self._children, boxes, np.ascontiguousarray(cloud), begun)
         return self._order[found], weights
+
+
+def signed_distances(
+    positions: Floats, triangles: Ints, weights: Floats, cloud: Floats, touching: float
+) -> tuple[Floats, Floats]:
+    """How far points are behind their closest ones, (p,), metres, and the unit vectors in which that grows, (p, 3).
+
+    Positive where the surface is beyond the point. On the surface itself the offset has no direction: the normal is its
+    limit.
+
+    Args:
+        positions: of the vertices, (v, 3), metres.
+        triangles: corners of those that hold the closest points, (p, 3).
+        weights: barycentric, of the closest points, (p, 3).
+        cloud: points, (p, 3), metres.
+        touching: as near as that, a point is on the surface, metres.
+    """
+    if IS_COMPILED:
+        return _signed(positions, triangles, weights, np.ascontiguousarray(cloud), touching)
+    corners = positions[triangles]
+    offsets = np.einsum("pk,pki->pi", weights, corners) - cloud
+    lengths = np.sqrt(np.einsum("pi,pi->p", offsets, offsets))
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.sqrt(np.einsum("pi,pi->p", normals, normals))[:, None]
+    on_it = lengths < touching
+    directions = np.where(on_it[:, None], normals, offsets / np.where(on_it, 1.0, lengths)[:, None])
+    side = np.where(np.einsum("pi,pi->p", directions, normals) < 0.0, -1.0, 1.0)
+    return side * lengths, side[:, None] * directions
+
+
+@compiled
+def _signed(
+    positions: Floats, triangles: Ints, weights: Floats, cloud: Floats, touching: float
+) -> tuple[Floats, Floats]:
+    distances, directions = np.empty(len(cloud)), np.empty((len(cloud), 3))
+    e, f, off, normal = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for point in range(len(cloud)):
+        a, b, c = triangles[point, 0], triangles[point, 1], triangles[point, 2]
+        for i in range(3):
+            e[i], f[i] = positions[b, i] - positions[a, i], positions[c, i] - positions[a, i]
+            off[i] = positions[a, i] + weights[point, 1] * e[i] + weights[point, 2] * f[i] - cloud[point, i]
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            normal[i] = e[j] * f[k] - e[k] * f[j]
+        length = np.sqrt(off[0] ** 2 + off[1] ** 2 + off[2] ** 2)
+        if length < touching:
+            size = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+            distances[point] = length
+            for i in range(3):
+                directions[point, i] = normal[i] / size
+            continue
+        side = -1.0 if off[0] * normal[0] + off[1] * normal[1] + off[2] * normal[2] < 0.0 else 1.0
+        distances[point] = side * length
+        for i in range(3):
+            directions[point, i] = side * off[i] / length
+    return distances, directions
 
 
 @compiled
@@ -102,12 +161,21 @@ def _boxes(corners: Floats, parts: Ints, children: Ints) -> Floats:
 
 
 @compiled
-def _closest(corners: Floats, parts: Ints, children: Ints, boxes: Floats, cloud: Floats) -> tuple[Ints, Floats]:
-    """Place, (p,), and barycentric weights, (p, 3): the nearer of two boxes first, none that is too far."""
-    found, weights = np.zeros(len(cloud), np.int64), np.zeros((len(cloud), 3))
+def _closest(
+    corners: Floats, parts: Ints, children: Ints, boxes: Floats, cloud: Floats, begun: Ints
+) -> tuple[Ints, Floats]:
+    """Place, (p,), and barycentric weights, (p, 3): the nearer of two boxes first, none that is too far.
+
+    It begins with a triangle for each point, (p,), or with none, (0,).
+    """
+    found, weights = np.zeros(len(cloud), np.int64), np.empty((len(cloud), 3))
     waiting, far = np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST)
     for point in range(len(cloud)):
+        x, y, z = cloud[point, 0], cloud[point, 1], cloud[point, 2]
         least, first, second = np.inf, 0.0, 0.0
+        if len(begun):
+            found[point] = begun[point]
+            least, first, second = _in_triangle(corners, begun[point], x, y, z)
         waiting[0], far[0], left = 0, 0.0, 1
         while left > 0:
             left -= 1
@@ -117,11 +185,11 @@ def _closest(corners: Floats, parts: Ints, children: Ints, boxes: Floats, cloud:
             child = children[box]
             if child < 0:
                 for triangle in range(parts[box, 0], parts[box, 1]):
-                    square, v, w = _in_triangle(corners[triangle], cloud[point])
+                    square, v, w = _in_triangle(corners, triangle, x, y, z)
                     if square < least:
                         least, first, second, found[point] = square, v, w, triangle
                 continue
-            near, other = _away(boxes[child], cloud[point]), _away(boxes[child + 1], cloud[point])
+            near, other = _away(boxes, child, x, y, z), _away(boxes, child + 1, x, y, z)
             if near > other:
                 near, other, child, beside = other, near, child + 1, child
             else:
@@ -137,30 +205,26 @@ def _closest(corners: Floats, parts: Ints, children: Ints, boxes: Floats, cloud:
 
 
 @compiled
-def _away(box: Floats, point: Floats) -> float:
+def _away(boxes: Floats, box: int, x: float, y: float, z: float) -> float:
     """Squared distance of a point from a box."""
-    square = 0.0
-    for i in range(3):
-        off = max(box[i] - point[i], 0.0, point[i] - box[3 + i])
-        square += off * off
-    return square
+    i = max(boxes[box, 0] - x, 0.0, x - boxes[box, 3])
+    j = max(boxes[box, 1] - y, 0.0, y - boxes[box, 4])
+    k = max(boxes[box, 2] - z, 0.0, z - boxes[box, 5])
+    return i * i + j * j + k * k
 
 
 @compiled
-def _in_triangle(corners: Floats, point: Floats) -> tuple[float, float, float]:
+def _in_triangle(corners: Floats, triangle: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Squared distance of the closest point of a triangle, and its weights at the second and third corner.
 
     The unconstrained minimum where it is inside, else the best of the three edges.
     """
-    ee = ef = ff = ge = gf = gg = 0.0
-    for i in range(3):
-        e, f, g = corners[1, i] - corners[0, i], corners[2, i] - corners[0, i], point[i] - corners[0, i]
-        ee += e * e
-        ef += e * f
-        ff += f * f
-        ge += g * e
-        gf += g * f
-        gg += g * g
+    ax, ay, az = corners[triangle, 0, 0], corners[triangle, 0, 1], corners[triangle, 0, 2]
+    ex, ey, ez = corners[triangle, 1, 0] - ax, corners[triangle, 1, 1] - ay, corners[triangle, 1, 2] - az
+    fx, fy, fz = corners[triangle, 2, 0] - ax, corners[triangle, 2, 1] - ay, corners[triangle, 2, 2] - az
+    gx, gy, gz = x - ax, y - ay, z - az
+    ee, ef, ff = ex * ex + ey * ey + ez * ez, ex * fx + ey * fy + ez * fz, fx * fx + fy * fy + fz * fz
+    ge, gf, gg = gx * ex + gy * ey + gz * ez, gx * fx + gy * fy + gz * fz, gx * gx + gy * gy + gz * gz
     size = ee * ff - ef * ef
     is_needle = not size > NEEDLE * ee * ff
     v, w = (ff * ge - ef * gf) / max(size, _TINY), (ee * gf - ef * ge) / max(size, _TINY)

@@ -312,7 +312,7 @@ class _Search:
 
     def _ended(self, local: LocalModel) -> LocalModel:
         """After the last step, too: too short for new derivatives, and all the same a part of the doubt."""
-        coefficients = self.evaluation.coefficients + local.step(self.limit)
+        coefficients = self.evaluation.coefficients + local.step(self.limit)[0]
         with suppress(NotConverged):
             self.evaluations += 1
             after = local.moved_to(self.problem.evaluation(coefficients, self.evaluation))
@@ -346,8 +346,7 @@ class _Search:
         """Take the best step within the limit; None when one was taken."""
         unsolved = False
         while self.limit > self.options.minimum_step:
-            change = local.step(self.limit)
-            largest = local.largest_movement(change)
+            change, largest = local.step(self.limit)
             try:
                 self.evaluations += 1
                 evaluation = self.problem.evaluation(self.evaluation.coefficients + change, self.evaluation)

@@ -229,14 +229,18 @@ class LocalModel:
         rotated = vectors.T @ (root * self.gradient)
         return -root * (vectors @ (rotated / (values + damping)))
 
-    def step(self, limit: float) -> Floats:
-        """The best change of the coefficients that moves no observed node further than the limit, metres."""
+    def step(self, limit: float) -> tuple[Floats, float]:
+        """The best change of the coefficients that moves no observed node further than the limit, and how far it does.
+
+        Args:
+            limit: metres.
+        """
         change, damping = self._whole, 0.0
-        while self.largest_movement(change) > 1.05 * limit or self.problem.is_too_far(change):
+        while (largest := self.largest_movement(change)) > 1.05 * limit or self.problem.is_too_far(change):
             self.is_undamped = False
             damping = max(1.6 * damping, 1e-8 * self._eigen[0][-1], 0.1)
             change = self._damped(damping)
-        return change
+        return change, largest
 
     def decrease(self, change: Floats) -> float:
         """Decrease of the objective that the model predicts."""

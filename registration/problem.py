@@ -117,7 +117,8 @@ class Problem(ParameterStack):
                 positions = positions + added
         pose = None if self.pose is None else self.pose.pose(coefficients[self.pose_part])
         cloud = self.cloud if pose is None else pose.inverse().apply(self.cloud)
-        match = self.observed.match(positions, cloud)
+        known = None if near is None or near.given is not self.cloud else near.match
+        match = self.observed.match(positions, cloud, known)
         return Evaluation(coefficients, self.observed, state, positions, pose, self.cloud, cloud, match, scaling)
 
     def _state(self, coefficients: Floats, near: ReducedState | None) -> tuple[ReducedState, float]:

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array, kron
 from softtwin.meshes.body import Body, Surface
 from softtwin.meshes.curvature import mean_curvature
 from softtwin.meshes.embedding import outer
-from softtwin.meshes.triangle_tree import TriangleTree
+from softtwin.meshes.triangle_tree import TriangleTree, signed_distances
 
 from .policy import ACCURACY
 from .surface_modes import SurfaceModes, surface_modes
@@ -96,25 +96,20 @@ class SurfaceDistance:
         """The smoothest functions on the observed side at rest."""
         return surface_modes(self.rest, self.triangles, ACCURACY.surface_modes)
 
-    def match(self, displacement: Floats, cloud: Floats) -> Correspondence:
+    def match(self, displacement: Floats, cloud: Floats, near: Correspondence | None = None) -> Correspondence:
         """A cloud (p, 3) matched to the surface moved by the displacement (m, 3) of the nodes `nodes`, metres.
 
         Args:
             displacement: of the nodes `nodes`, (m, 3), metres.
             cloud: points, (p, 3), metres.
+            near: the same cloud on the surface where it was nearby, which makes the search shorter.
         """
         positions = self.rest + self._carried(displacement)
-        triangles, weights = self._tree.closest(positions, cloud)
-        corners = positions[self.triangles[triangles]]
-        offsets = np.einsum("pk,pki->pi", weights, corners) - cloud
-        lengths = np.sqrt(np.einsum("pi,pi->p", offsets, offsets))
-        normals, doubled = _normals(corners)
-        # On the surface itself the offset has no direction: the normal is its limit.
-        on_it = lengths < 1e-12 * self.body.size
-        directions = np.where(on_it[:, None], normals, offsets / np.where(on_it, 1.0, lengths)[:, None])
-        side = np.where(np.einsum("pi,pi->p", directions, normals) < 0.0, -1.0, 1.0)
-        match = Correspondence(side * lengths, side[:, None] * directions, triangles, weights, weights)
-        return match if self.distance == "surface" else _to_planes(match, corners, cloud, normals, doubled)
+        triangles, weights = self._tree.closest(positions, cloud, None if near is None else near.triangles)
+        vertices = self.triangles[triangles]
+        distances, directions = signed_distances(positions, vertices, weights, cloud, 1e-12 * self.body.size)
+        match = Correspondence(distances, directions, triangles, weights, weights)
+        return match if self.distance == "surface" else _to_planes(match, positions[vertices], cloud)
 
     def facing(self, match: Correspondence, displacement: Floats) -> Floats:
         """Unit normals of the moved triangles that hold a match's closest points, (p, 3).
@@ -243,10 +238,9 @@ def _normals(corners: Floats) -> tuple[Floats, Floats]:
     return normals / doubled[:, None], doubled
 
 
-def _to_planes(
-    match: Correspondence, corners: Floats, cloud: Floats, normals: Floats, doubled: Floats
-) -> Correspondence:
+def _to_planes(match: Correspondence, corners: Floats, cloud: Floats) -> Correspondence:
     """The same match with distances to the planes of the triangles, but of points far beside their own."""
+    normals, doubled = _normals(corners)
     first, second, arm = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], cloud - corners[:, 0]
     closest_points = np.empty_like(match.weights)
     closest_points[:, 1] = np.einsum("pi,pi->p", np.cross(arm, second), normals) / doubled

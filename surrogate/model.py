@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.sparse_products import product
 from softtwin.reference.data.discrepancy import Discrepancy
 from softtwin.reference.data.inputs import Change, Inputs
 from softtwin.reference.data.loading import checked_array
@@ -445,7 +446,7 @@ class ReducedSurrogateState:
 
     def jacobian(self, rows: csr_array) -> Floats:
         """Derivative of linear functions of the chosen displacements, (q, k), for rows (q, 3p); no more is touched."""
-        both, count = rows @ self.model.rows, self.model.count
+        both, count = product(rows, self.model.rows), self.model.count
         return both[:, :count] + both[:, count:] @ self._tangent
 
     def moved(self, change: Floats, every: int = 1) -> Floats:

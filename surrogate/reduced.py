@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -38,6 +38,34 @@ _WEIGHT_DECAY = 0.2  # less of it is more exact on loads like those of the train
 _RATE, _AT_A_TIME = 1e-3, 128  # while it is used: learning rate, falling to zero; samples a step, new and known ones
 _LEAST_WEIGHED = 0.01  # of the mean square, as `pod.semi_relative` has it
 _SHARE = 4  # one sample in so many enters the gradient's loss: it costs three times the other and needs fewer
+
+
+Array = NDArray[Any]  # in the network's own precision
+Layer = tuple[Array, Array]  # weights, (in, out), and bias, (out,)
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """An averaged network's memory as arrays.
+
+    Args:
+        turns: of its coordinates, (g, r, r).
+        input_scale: (r,).
+        output_scale: one number.
+        gate: squared length of the scaled input below which the correction fades.
+        enter, leave: the first and the last layer.
+        pairs: the two layers of each block.
+        rest: what the blocks give at rest, (r,).
+    """
+
+    turns: Array
+    input_scale: Array
+    output_scale: Any
+    gate: Any
+    enter: Layer
+    pairs: list[tuple[Layer, Layer]]
+    leave: Layer
+    rest: Array
 
 
 @dataclass(frozen=True)
@@ -204,6 +232,7 @@ class AveragedNetwork(ReducedNetwork):
 
     turns: Tensor
     rest: Tensor
+    _arrays: Arrays | None = None
 
     def __init__(self, network: ReducedNetwork, turns: Tensor) -> None:
         width, depth = network.enter.out_features, len(network.inner)
@@ -214,6 +243,26 @@ class AveragedNetwork(ReducedNetwork):
         with torch.no_grad():
             self.register_buffer("rest", self.blocks(torch.zeros_like(self.input_scale[None]))[0])
         self.register_buffer("turns", turns.to(self.rest))
+
+    @property
+    def arrays(self) -> Arrays:
+        """Its memory: what changes the one changes the other."""
+        if self._arrays is None:
+            scale = self.input_scale.numpy()
+            gate = scale.dtype.type(len(scale) * _GATE**2)
+            pairs = [(_layer(inner), _layer(outer)) for inner, outer in self.pairs]
+            ends, own = (_layer(self.enter), _layer(self.leave)), (self.turns.numpy(), self.rest.numpy())
+            factor = self.output_scale.numpy()[()]
+            self._arrays = Arrays(own[0], scale, factor, gate, ends[0], pairs, ends[1], own[1])
+        return self._arrays
+
+    def _apply(self, function: Any, recurse: bool = True) -> AveragedNetwork:
+        self._arrays = None  # another precision has other memory
+        super()._apply(function, recurse)
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_arrays": None}  # so has a copy
 
     def forward(self, coordinates: Tensor) -> Tensor:
         """Correction coordinates, (s, r), metres, for load coordinates, (s, r), newtons."""
@@ -230,51 +279,66 @@ class AveragedNetwork(ReducedNetwork):
 class LinearisedAverage:
     """An averaged network at one point, with derivatives by hand.
 
+    In NumPy, on the network's own memory: at one point torch spends several times as long on being called as on what it
+    is called for.
+
     Args:
-        network: the network; its weights need no gradient.
+        network: the network, on the processor; its weights need no gradient.
         coordinates: the point, (r,).
     """
 
     def __init__(self, network: AveragedNetwork, coordinates: Tensor) -> None:
-        self.network = network
-        self._x = (network.turns @ coordinates) * network.input_scale  # (g, r)
-        self._trace: list[Tensor] = []
-        self._missing = network.blocks(self._x, self._trace) - network.rest
-        self._gate = network.gate(self._x)
-        values = self._gate * self._missing * network.output_scale
-        self.values = (values[:, None] @ network.turns).mean(dim=0)[0]
+        self._net = net = network.arrays
+        self._x = (net.turns @ coordinates.numpy()) * net.input_scale  # (g, r)
+        square = np.square(self._x).sum(axis=1, keepdims=True)
+        self._gate = np.sqrt(square / (square + net.gate))
+        hidden = self._x @ net.enter[0] + net.enter[1]
+        self._trace: list[tuple[Array, Array]] = []
+        for inner, outer in net.pairs:
+            z = hidden @ inner[0] + inner[1]
+            normal = 0.5 + 0.5 * torch.erf(torch.from_numpy(_ROOT_HALF * z)).numpy()
+            self._trace.append((z, normal))
+            hidden = hidden + (z * normal) @ outer[0] + outer[1]
+        self._missing = hidden @ net.leave[0] + net.leave[1] - net.rest
+        values = (self._gate * self._missing)[:, None] @ net.turns
+        self.values = torch.from_numpy(net.output_scale * values.mean(axis=0)[0])
 
     @cached_property
-    def _slopes(self) -> tuple[Tensor, Tensor]:
-        """Of the gate, (g, r), zero at rest where the values are zero as well, and of the activations, (b, g, w)."""
-        x, count = self._x, self._x.shape[1]
-        square = x.square().mean(dim=1, keepdim=True)
-        gate = x * (_GATE**2 / count) / (self._gate.clamp_min(_TINY) * (square + _GATE**2) ** 2)
-        z = torch.stack(self._trace)
-        return gate, 0.5 + 0.5 * torch.erf(_ROOT_HALF * z) + z * torch.exp(-0.5 * z * z) * _DENSITY
+    def _slopes(self) -> tuple[Array, list[Array]]:
+        """Of the gate, (g, r), zero at rest where the values are zero as well, and of each activation, (g, w)."""
+        x, limit = self._x, self._net.gate
+        square = np.square(x).sum(axis=1, keepdims=True)
+        gate = x * limit / (np.maximum(self._gate, _TINY) * np.square(square + limit))
+        return gate, [normal + z * np.exp(-0.5 * z * z) * _DENSITY for z, normal in self._trace]
 
     def jvp(self, tangents: Tensor) -> Tensor:
         """Changes of the values, (r, k), for changes of the coordinates, (r, k)."""
-        net = self.network
-        gate, slopes = self._slopes
-        dx = (tangents.T @ net.turns.mT) * net.input_scale  # (g, k, r)
-        hidden = dx @ net.enter.weight.T
+        net, (gate, slopes) = self._net, self._slopes
+        dx = (tangents.numpy().T @ net.turns.transpose(0, 2, 1)) * net.input_scale  # (g, k, r)
+        hidden = dx @ net.enter[0]
         for slope, (inner, outer) in zip(slopes, net.pairs, strict=True):
-            hidden = hidden + (slope[:, None] * (hidden @ inner.weight.T)) @ outer.weight.T
-        change = self._gate[:, None] * (hidden @ net.leave.weight.T)
+            bent = hidden @ inner[0]
+            bent *= slope[:, None]
+            hidden += bent @ outer[0]
+        change = hidden @ net.leave[0]
+        change *= self._gate[:, None]
         change += (dx @ gate[:, :, None]) * self._missing[:, None]
-        return ((change * net.output_scale) @ net.turns).mean(dim=0).T
+        change *= net.output_scale
+        return torch.from_numpy((change @ net.turns).mean(axis=0).T)
 
     def vjp(self, cotangent: Tensor) -> Tensor:
         """Gradient with respect to the coordinates, (r,), for one with respect to the values, (r,)."""
-        net = self.network
-        gate, slopes = self._slopes
-        change = (net.turns @ cotangent) * (net.output_scale / len(net.turns))  # (g, r)
-        hidden = (self._gate * change) @ net.leave.weight
-        for slope, (inner, outer) in zip(slopes.flip(0), reversed(net.pairs), strict=True):
-            hidden = hidden + (slope * (hidden @ outer.weight)) @ inner.weight
-        dx = hidden @ net.enter.weight + gate * (self._missing * change).sum(dim=1, keepdim=True)
-        return ((dx * net.input_scale)[:, None] @ net.turns).sum(dim=0)[0]
+        net, (gate, slopes) = self._net, self._slopes
+        change = (net.turns @ cotangent.numpy()) * (net.output_scale / len(net.turns))  # (g, r)
+        hidden = (self._gate * change) @ net.leave[0].T
+        for slope, (inner, outer) in zip(reversed(slopes), reversed(net.pairs), strict=True):
+            hidden = hidden + (slope * (hidden @ outer[0].T)) @ inner[0].T
+        dx = hidden @ net.enter[0].T + gate * (self._missing * change).sum(axis=1, keepdims=True)
+        return torch.from_numpy(((dx * net.input_scale)[:, None] @ net.turns).sum(axis=0)[0])
+
+
+def _layer(layer: nn.Linear) -> Layer:
+    return layer.weight.detach().numpy().T, layer.bias.detach().numpy()
 
 
 # ------------------------------------------------------------------ what it learns

@@ -14,6 +14,8 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from softtwin.meshes.sparse_products import product
+
 from ..evaluation import Evaluation, Slopes
 from ..expectations import Expectations
 from ..hyperparameters import Hyperparameters, LogNormalPrior
@@ -228,7 +230,7 @@ class FieldBlock(ParameterBlock):
 
     def jacobian(self, at: Evaluation, coefficients: Floats, slopes: Slopes) -> Floats:
         """See `ParameterBlock.jacobian`."""
-        return self.amplitude * np.asarray(slopes.rows @ self.observed_modes)
+        return self.amplitude * product(slopes.rows, self.observed_modes)
 
     def vjp(self, at: Evaluation, coefficients: Floats, slopes: Slopes, cotangent: Floats) -> Floats:
         """See `ParameterBlock.vjp`."""

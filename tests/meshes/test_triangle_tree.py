@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from softtwin.meshes import compiled as compilation
 from softtwin.meshes import triangle_tree
 from softtwin.meshes.shapes import liver_phantom
-from softtwin.meshes.triangle_tree import TriangleTree
+from softtwin.meshes.triangle_tree import TriangleTree, signed_distances
 
 Floats = NDArray[np.float64]
 
@@ -35,9 +35,15 @@ def surface() -> tuple[Floats, NDArray[np.int64]]:
     return phantom.points[vertices], local.reshape(-1, 3)
 
 
-def lengths(positions: Floats, triangles: NDArray[np.int64], cloud: Floats, tree: TriangleTree) -> Floats:
+def lengths(
+    positions: Floats,
+    triangles: NDArray[np.int64],
+    cloud: Floats,
+    tree: TriangleTree,
+    near: NDArray[np.int64] | None = None,
+) -> Floats:
     """Distances of the closest points found, which lie in their triangles."""
-    found, weights = tree.closest(positions, cloud)
+    found, weights = tree.closest(positions, cloud, near)
     assert weights.min() > -1e-12
     np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-12)
     places = np.einsum("pk,pki->pi", weights, positions[triangles[found]])
@@ -69,8 +75,10 @@ def test_the_closest_is_found_wherever_the_surface_is(surface, rng, how: str, fa
     cloud = positions[triangles[rng.integers(len(triangles), size=400)]].mean(axis=1)
     cloud += far * rng.standard_normal(cloud.shape)
     wanted = np.sqrt(igl.point_mesh_squared_distance(cloud, np.ascontiguousarray(positions), triangles)[0])
-    found = lengths(positions, triangles, cloud, TriangleTree(rest, triangles))
-    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+    tree = TriangleTree(rest, triangles)
+    np.testing.assert_allclose(lengths(positions, triangles, cloud, tree), wanted, rtol=1e-9, atol=1e-9)
+    guessed = rng.integers(len(triangles), size=len(cloud))  # wherever the search begins
+    np.testing.assert_allclose(lengths(positions, triangles, cloud, tree, guessed), wanted, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.usefixtures("engine")
@@ -125,3 +133,17 @@ def test_without_a_place_for_its_cache_a_loop_is_compiled_all_the_same(monkeypat
 def test_without_numba_a_function_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compilation, "numba", None)
     assert compilation.compiled(abs) is abs
+
+
+@pytest.mark.usefixtures("engine")
+def test_distances_have_the_sign_of_the_side(surface, rng) -> None:
+    """Of points beyond and behind a surface by known lengths, and of points on it, whose direction is the normal."""
+    rest, triangles = surface
+    middles, corners = rest[triangles].mean(axis=1), rest[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    off = rng.choice([-1e-4, 0.0, 1e-4, 1e-3], size=len(triangles))
+    third = np.full((len(triangles), 3), 1.0 / 3.0)
+    found, directions = signed_distances(rest, triangles, third, middles + off[:, None] * normals, 1e-13)
+    np.testing.assert_allclose(found, -off, atol=1e-15)
+    np.testing.assert_allclose(directions, normals, atol=1e-9)
