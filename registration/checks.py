@@ -144,7 +144,8 @@ def shared(closest_points: Floats, distances: Floats, weights: Floats) -> float:
     if count < 1 or not values.any():
         return 0.0
     asked = slice(None, None, max(1, len(points) // ACCURACY.asked))
-    _, near = cKDTree(points).query(points[asked], k=count + 1)
+    tree = cKDTree(points, compact_nodes=False, balanced_tree=False)  # so few are asked that it pays to make it quickly
+    _, near = tree.query(points[asked], k=count + 1)
     beside = values[near[:, 1:]].mean(axis=1)
     return float(np.clip((values[asked] * beside).mean() / (values**2).mean(), 0.0, 1.0))
 

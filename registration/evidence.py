@@ -101,6 +101,11 @@ class Hyperprior:
     @classmethod
     def of(cls, priors: Sequence[LogNormalPrior]) -> Hyperprior:
         """The same of the scales themselves."""
+        return cls._of(tuple(priors))
+
+    @classmethod
+    @lru_cache(maxsize=64)  # the same with each frame
+    def _of(cls, priors: tuple[LogNormalPrior, ...]) -> Hyperprior:
         rows = [(np.clip(each.median, each.minimum, each.maximum), each.minimum, each.maximum) for each in priors]
         with np.errstate(divide="ignore"):
             median, lowest, highest = np.log(np.array(rows)).T

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +47,7 @@ class Pose:
         object.__setattr__(self, "translation", _frozen(translation))
 
     @classmethod
+    @cache
     def identity(cls) -> Pose:
         """The pose of a camera whose coordinates are the body's."""
         return cls(np.eye(3), np.zeros(3))

@@ -90,7 +90,7 @@ def gain_by_shared_noise(local: LocalModel, problem: Problem) -> tuple[float, fl
     if problem.shared is None:
         return best
     few = _SharedNoise(local, problem.shared.leading(ACCURACY.first_modes), problem.hyperprior)
-    if all(few.promised(length) < ACCURACY.worth for length in few.lengths):
+    if few.promised.max() < ACCURACY.worth:
         return best
     every = _SharedNoise(local, problem.shared, problem.hyperprior)
     found = max(best, *(every.best(length) for length in every.lengths))
@@ -120,21 +120,24 @@ class _SharedNoise:
             hyperprior.lowest[LENGTH], hyperprior.highest[LENGTH], ACCURACY.lengths
         ).tolist()
 
-    def _scaled(self, length: float) -> tuple[Floats, Floats]:
-        """Slope and covariance by coefficients of unit variance, for the logarithm of a length."""
-        root = np.tile(np.exp(0.5 * self._modes.log_variances(np.exp(length))[0]), 3)
-        return root * self._pull, root[:, None] * self._covariance * root
+    def _variances(self, length: float) -> Floats:
+        """Of the coefficients of a field of unit variance, for the logarithm of a length, (c,)."""
+        return np.tile(np.exp(self._modes.log_variances(np.exp(length))[0]), 3)
 
-    def promised(self, length: float) -> float:
-        """Top of the parabola for the logarithm of a length; 0 where it falls."""
-        slopes, matrix = self._scaled(length)
-        slope, bend = 0.5 * float(slopes @ slopes - np.trace(matrix)), 0.5 * float(np.sum(matrix**2))
-        return 0.5 * slope**2 / bend if slope > 0.0 else 0.0
+    @property
+    def promised(self) -> Floats:
+        """Top of the parabola for each length; 0 where it falls."""
+        variances = np.array([self._variances(length) for length in self.lengths])
+        slopes = 0.5 * variances @ (self._pull**2 - np.diag(self._covariance))
+        bends = 0.5 * ((variances @ self._covariance**2) * variances).sum(axis=1)
+        found: Floats = 0.5 * np.maximum(slopes, 0.0) ** 2 / bends
+        return found
 
     def best(self, length: float) -> tuple[float, float, float]:
         """The most of the gain for the logarithm of a length, and the logarithms of size and length, metres."""
-        slopes, matrix = self._scaled(length)
-        values, vectors = np.linalg.eigh(matrix)
+        root = np.sqrt(self._variances(length))
+        slopes = root * self._pull
+        values, vectors = np.linalg.eigh(root[:, None] * self._covariance * root)
         grown = np.exp(2.0 * self._sizes)[:, None] * np.maximum(values, 0.0)
         squares = np.exp(2.0 * self._sizes)[:, None] * (vectors.T @ slopes) ** 2
         off = (length - self._hyperprior.median[LENGTH]) / self._hyperprior.spread[LENGTH]
