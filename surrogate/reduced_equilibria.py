@@ -24,6 +24,7 @@ from softtwin.reference.data.secants import Secants
 
 from .algebra import TorchAlgebra
 from .architecture import Linearisation, Network
+from .invariants import densities, has_invariants, invariants_of
 from .jets import Jet, JetAlgebra
 
 Floats = NDArray[np.float64]
@@ -367,12 +368,21 @@ class GalerkinNetwork(Network):
         """
         read = self._read
         held = read.support @ q
-        F, algebra = _gradients(read, q), JetAlgebra(1)
-        if not self._law.is_linear and not _determinants(F).min() > 0.0:
-            return np.inf, held
-        density = self._law.energy(algebra.variable(F), None, read.parameters, algebra)
-        energy = float(density.value @ read.weights + 0.5 * (held @ q))
-        return energy, (density.first * read.weights[:, None]).ravel() @ read.flat + held
+        F = _gradients(read, q)
+        if self._has_invariants:
+            flat = F.reshape(-1, 9)
+            invariants = invariants_of(flat)
+            if not invariants[:, 2].min() > 0.0:
+                return np.inf, held
+            density, stress = densities(self._law, read.parameters, flat, invariants, 1)
+        else:
+            if not self._law.is_linear and not _determinants(F).min() > 0.0:
+                return np.inf, held
+            algebra = JetAlgebra(1)
+            jet = self._law.energy(algebra.variable(F), None, read.parameters, algebra)
+            density, stress = jet.value, jet.first
+        energy = float(density @ read.weights + 0.5 * (held @ q))
+        return energy, (stress * read.weights[:, None]).ravel() @ read.flat + held
 
     def stiffness(self, q: Floats, exact: bool = True) -> Floats:
         """Second derivative of the stored energy, (r, r), N/m; in single precision where six digits are enough.
@@ -391,9 +401,17 @@ class GalerkinNetwork(Network):
 
     def _moduli(self, q: Floats) -> Floats:
         """Second derivatives of the energy density by F, (p, 9, 9), pascals."""
-        read, algebra = self._read, JetAlgebra(2)
-        second = self._law.energy(algebra.variable(_gradients(read, q)), None, read.parameters, algebra).second
+        read, F = self._read, _gradients(self._read, q)
+        if self._has_invariants:
+            flat = F.reshape(-1, 9)
+            return densities(self._law, read.parameters, flat, invariants_of(flat), 2)[1]
+        algebra = JetAlgebra(2)
+        second = self._law.energy(algebra.variable(F), None, read.parameters, algebra).second
         return np.broadcast_to(second, (len(read.weights), 9, 9))
+
+    @cached_property
+    def _has_invariants(self) -> bool:
+        return has_invariants(self._law)
 
 
 def _gradients(read: _Cells, q: Floats) -> Floats:
