@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from softtwin.meshes.compiled import IS_COMPILED, compiled
 from softtwin.reference.data.materials import Material
 
-from .jets import Jet, logarithm
-
 Floats = NDArray[np.float64]
 
 
@@ -57,6 +55,95 @@ class _Symmetric:
         return self * (1.0 / factor)
 
 
+Part = Floats | float  # a number at each point, or one for all
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+class _Scalar:
+    """A function of the invariants at each point, with derivatives by them: most of these are zero, and stay so.
+
+    Args:
+        value: (p,).
+        first: by each invariant.
+        second: by each of `_PAIRS`; None where only the first are wanted.
+    """
+
+    __array_ufunc__ = None  # an array of NumPy's times a scalar is the scalar's business
+
+    def __init__(self, value: Part, first: list[Part], second: list[Part] | None) -> None:
+        self.value, self.first, self.second = value, first, second
+
+    def of(self, value: Part, slope: Part, curvature: Part) -> _Scalar:
+        """A function of it, by its value and its two derivatives there."""
+        first, second = self.first, None
+        if self.second is not None:
+            bent = [_times(_times(first[a], first[b]), curvature) for a, b in _PAIRS]
+            second = [_plus(_times(part, slope), more) for part, more in zip(self.second, bent, strict=True)]
+        return _Scalar(value, [_times(part, slope) for part in first], second)
+
+    def _scaled(self, factor: Part) -> _Scalar:
+        second = None if self.second is None else [_times(part, factor) for part in self.second]
+        return _Scalar(self.value * factor, [_times(part, factor) for part in self.first], second)
+
+    def __add__(self, other: _Scalar | Part) -> _Scalar:
+        if not isinstance(other, _Scalar):
+            return _Scalar(self.value + other, self.first, self.second)
+        second = None
+        if self.second is not None and other.second is not None:
+            second = list(map(_plus, self.second, other.second))
+        return _Scalar(self.value + other.value, list(map(_plus, self.first, other.first)), second)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> _Scalar:
+        return self._scaled(-1.0)
+
+    def __sub__(self, other: _Scalar | Part) -> _Scalar:
+        return self + -other
+
+    def __rsub__(self, other: Part) -> _Scalar:
+        return -self + other
+
+    def __mul__(self, other: _Scalar | Part) -> _Scalar:
+        if not isinstance(other, _Scalar):
+            return self._scaled(other)
+        first = [
+            _plus(_times(p, other.value), _times(q, self.value)) for p, q in zip(self.first, other.first, strict=True)
+        ]
+        second = None
+        if self.second is not None and other.second is not None:
+            mixed = [
+                _plus(_times(self.first[a], other.first[b]), _times(self.first[b], other.first[a])) for a, b in _PAIRS
+            ]
+            both = zip(self.second, other.second, mixed, strict=True)
+            second = [_plus(_plus(_times(p, other.value), _times(q, self.value)), more) for p, q, more in both]
+        return _Scalar(self.value * other.value, first, second)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: _Scalar | Part) -> _Scalar:
+        return self * other**-1.0
+
+    def __pow__(self, power: float) -> _Scalar:
+        x = self.value
+        if power == 2:
+            return self.of(x * x, 2.0 * x, 2.0)
+        return self.of(x**power, power * x ** (power - 1), power * (power - 1) * x ** (power - 2))
+
+
+def _times(one: Part, other: Part) -> Part:
+    """The product, 0 where one of them is 0 everywhere."""
+    is_zero = (isinstance(one, float) and one == 0.0) or (isinstance(other, float) and other == 0.0)
+    return 0.0 if is_zero else one * other
+
+
+def _plus(one: Part, other: Part) -> Part:
+    """The sum, of which a zero everywhere is left out."""
+    if isinstance(one, float) and one == 0.0:
+        return other
+    return one if isinstance(other, float) and other == 0.0 else one + other
+
+
 class _InvariantAlgebra:
     """The tensor functions that energies are written in (`materials.Algebra`), for energies of invariants.
 
@@ -66,10 +153,11 @@ class _InvariantAlgebra:
     """
 
     def __init__(self, invariants: Floats, order: int) -> None:
-        second = np.zeros(()) if order == 2 else None
-        ways = np.eye(3)[:, None]
+        columns = np.ascontiguousarray(invariants.T)
+        ways: list[list[Part]] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
         self._first, self._second, self._jacobian = (
-            Jet(value, way, second) for value, way in zip(invariants.T, ways, strict=True)
+            _Scalar(value, way, [0.0] * len(_PAIRS) if order == 2 else None)
+            for value, way in zip(columns, ways, strict=True)
         )
 
     def Identity(self, size: int) -> _Symmetric:  # noqa: N802 - UFL's name
@@ -98,7 +186,7 @@ class _InvariantAlgebra:
             raise NotIsotropicError("tr: expected a symmetric tensor, got F.")
         return 3.0 * A.unit + A.strain * self._first
 
-    def det(self, A: Any) -> Jet:
+    def det(self, A: Any) -> _Scalar:
         """The determinant of F."""
         if isinstance(A, _Gradient):
             return self._jacobian
@@ -113,9 +201,10 @@ class _InvariantAlgebra:
             return 3.0 * A.unit * B.unit + mixed * self._first + A.strain * B.strain * self._second
         raise NotIsotropicError("inner: expected F : F or symmetric tensors, got others.")
 
-    def ln(self, a: Jet) -> Jet:
-        """The natural logarithm; NaN where a cell is inside out."""
-        return logarithm(a, np.log)
+    def ln(self, a: _Scalar) -> _Scalar:
+        """The natural logarithm."""
+        inverse = 1.0 / a.value
+        return a.of(np.log(a.value), inverse, -inverse * inverse)
 
 
 def has_invariants(law: Material) -> bool:
@@ -144,11 +233,19 @@ def densities(law: Material, parameters: Any, F: Floats, invariants: Floats, ord
         invariants: of these, (p, 3), with determinants that the law takes.
         order: 1 for the stress, 2 for the moduli.
     """
-    found: Jet = law.energy(_Gradient(), None, parameters, _InvariantAlgebra(invariants, order))
-    first = np.ascontiguousarray(np.broadcast_to(found.first, (len(F), 3)))
+    found: _Scalar = law.energy(_Gradient(), None, parameters, _InvariantAlgebra(invariants, order))
+    value = np.broadcast_to(found.value, len(F))
     if found.second is None:
-        return found.value, _stresses(F, first)
-    return found.value, _moduli(F, first, np.ascontiguousarray(np.broadcast_to(found.second, (len(F), 3, 3))))
+        return value, _stresses(F, _columns(found.first, len(F)))
+    return value, _moduli(F, _columns(found.first, len(F)), _columns(found.second, len(F)))
+
+
+def _columns(parts: list[Part], count: int) -> Floats:
+    """Of each point, (p, c)."""
+    found = np.empty((count, len(parts)))
+    for column, part in enumerate(parts):
+        found[:, column] = part
+    return found
 
 
 @compiled
@@ -200,14 +297,15 @@ def _stresses(F: Floats, first: Floats) -> Floats:
 
 @compiled
 def _moduli(F: Floats, first: Floats, second: Floats) -> Floats:
-    """Of the derivatives by the invariants, (p, 3) and (p, 3, 3): (p, 9, 9)."""
+    """Of the derivatives by the invariants, (p, 3), and by their pairs, (p, 6): (p, 9, 9)."""
     found, C, g, bent = np.empty((len(F), 9, 9)), np.empty((3, 3)), np.empty((3, 9)), np.empty((3, 9))
     for p in range(len(F)):
-        f = F[p]
+        f, w = F[p], second[p]
         _slopes(f, C, g)
-        for a in range(3):
-            for n in range(9):
-                bent[a, n] = second[p, a, 0] * g[0, n] + second[p, a, 1] * g[1, n] + second[p, a, 2] * g[2, n]
+        for n in range(9):
+            bent[0, n] = w[0] * g[0, n] + w[1] * g[1, n] + w[2] * g[2, n]
+            bent[1, n] = w[1] * g[0, n] + w[3] * g[1, n] + w[4] * g[2, n]
+            bent[2, n] = w[2] * g[0, n] + w[4] * g[1, n] + w[5] * g[2, n]
         for m in range(9):
             for n in range(9):
                 found[p, m, n] = g[0, m] * bent[0, n] + g[1, m] * bent[1, n] + g[2, m] * bent[2, n]

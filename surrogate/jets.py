@@ -195,18 +195,8 @@ class JetAlgebra:
 
     def ln(self, a: Jet) -> Jet:
         """The natural logarithm; NaN where a cell is inside out."""
-        return logarithm(a, self._arrays.log)
-
-
-def logarithm(a: Jet, log: Callable[[Array], Array]) -> Jet:
-    """The natural logarithm of a scalar.
-
-    Args:
-        a: the scalar.
-        log: of the arrays that it is made of.
-    """
-    inverse = 1.0 / a.value
-    return a._of(log(a.value), inverse, -inverse * inverse)
+        inverse = 1.0 / a.value
+        return a._of(self._arrays.log(a.value), inverse, -inverse * inverse)
 
 
 def _flat(first: Array) -> Array:

@@ -395,9 +395,10 @@ class GalerkinNetwork(Network):
         moduli = self._moduli(q) * read.weights[:, None, None]
         if exact:
             return read.flat.T @ np.matmul(moduli, read.flat.reshape(-1, 9, size)).reshape(-1, size) + read.support
-        bent = torch.bmm(torch.from_numpy(moduli.astype(np.float32)), torch.from_numpy(read.slopes)).numpy()
-        found: Floats = (read.turned @ bent.reshape(-1, size)).astype(np.float64) + read.support
-        return found
+        # In single precision torch's products take two thirds of the time of NumPy's.
+        bent = torch.bmm(torch.from_numpy(moduli.astype(np.float32)), torch.from_numpy(read.slopes))
+        found: Floats = (torch.from_numpy(read.turned) @ bent.reshape(-1, size)).numpy().astype(np.float64)
+        return found + read.support
 
     def _moduli(self, q: Floats) -> Floats:
         """Second derivatives of the energy density by F, (p, 9, 9), pascals."""
