@@ -17,6 +17,7 @@ from .signals import restore_sigpipe
 _GMSH_LOCK = threading.RLock()  # gmsh has one global state
 _TETRAHEDRON, _TRIANGLE = 4, 2  # gmsh's element types
 _FEWEST_VERTICES = 30
+_ATTEMPTS, _MORE = 10, 1.04  # numbers of vertices that are tried, and the factor from one to the next
 _VERTICES_PER_CLUSTER = 10  # of the surface before remeshing, for clusters of even size
 
 
@@ -101,11 +102,24 @@ def fill(gmsh: Any, size: float) -> tuple[Floats, Ints]:
 
 
 def _remeshed(surface: Surface, size: float) -> Surface:
+    """The surface in triangles of about one size; in a few more where so many close no surface."""
+    count = max(int(surface.area / (size**2 * np.sqrt(3) / 2)), _FEWEST_VERTICES)
+    for attempt in range(_ATTEMPTS):
+        try:
+            return checked_surface(_clustered(surface, round(count * _MORE**attempt)))
+        except SurfaceError as error:
+            reason = error
+    raise SurfaceError(
+        f"surface: remeshed with triangles of {size * 1e3:.3g} mm it lost its shape ({reason}); choose smaller cells."
+    ) from reason
+
+
+def _clustered(surface: Surface, count: int) -> Surface:
+    """About so many vertices, evenly over the surface: thin parts may come out with open edges, or folded."""
     # Clustering (ACVD) never hangs; gmsh's own remeshing does, when it cannot flatten a patch with tiny triangles.
     import pyacvd
     import pyvista
 
-    count = max(int(surface.area / (size**2 * np.sqrt(3) / 2)), _FEWEST_VERTICES)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pyacvd uses a name that pyvista deprecates
         make: Any = pyvista.PolyData.from_regular_faces  # its stubs refuse float64
@@ -115,13 +129,7 @@ def _remeshed(surface: Surface, size: float) -> Surface:
             clusters.subdivide(int(rounds))
         clusters.cluster(count)
         mesh = clusters.create_mesh()
-    try:
-        return checked_surface(Surface(np.asarray(mesh.points, float), np.asarray(mesh.regular_faces)))
-    except SurfaceError as error:
-        raise SurfaceError(
-            f"surface: remeshed with triangles of {size * 1e3:.3g} mm it lost its shape ({error}); "
-            "choose smaller cells."
-        ) from error
+    return Surface(np.asarray(mesh.points, float), np.asarray(mesh.regular_faces))
 
 
 def _load(gmsh: Any, surface: Surface) -> None:

@@ -82,9 +82,9 @@ def test_its_size_and_length_are_told(body: Body) -> None:
 
 @pytest.mark.slow
 def test_forces_are_as_far_off_as_they_say(body: Body) -> None:
-    """Net forces across the beam: z^2 = e' S^-1 e / 2, 0.69 in the median of a right law."""
+    """Net forces across the beam: z^2 = e' S^-1 e / 2, 0.69 in the median of a right law; a few are far off."""
     made, scores = registrar(body), []
-    for seed in range(60):
+    for seed in range(140):
         rng = np.random.default_rng(seed)
         found = made.register(shaken(cloud_on(body, truth(body), 400, rng), rng))
         missed = (found.net_force - NET)[1:]
