@@ -18,7 +18,7 @@ from .laplace import posterior
 from .local_model import LocalModel, without_shared_noise
 from .loss import REJECTED, Huber, Loss, Tukey, robust_deviation
 from .outcome import Outcome
-from .policy import ACCURACY
+from .policy import ACCURACY, POLICY
 from .posterior import Posterior
 from .problem import Problem
 from .score import gain_by_shared_noise
@@ -84,6 +84,12 @@ class SolverResult:
         return self.weights >= REJECTED
 
     @property
+    def has_shared_noise(self) -> bool:
+        """Whether neighbours share more noise than the least that any camera has."""
+        is_sought = self.local.problem.shared is not None
+        return is_sought and self.local.scales.shared >= POLICY.noise_minimum
+
+    @property
     def rms_distance(self) -> float:
         """Root mean square distance of the points that count, metres; of all where none does."""
         distances = self.evaluation.match.distances
@@ -112,6 +118,8 @@ class GaussNewton:
         minimum_step: no step that moves all observed nodes less than this is tried, metres.
         is_near: the start is near: hyperparameters that are known there are sought anew with the last loss alone, and
             whether a step was the last is seen by the derivatives before it, where it kept what they promised.
+        is_shared: neighbours are known to share noise: it is sought from the first step on. Else forces would explain
+            it first, as far as they can.
         until: no step is begun after this time of the monotonic clock, seconds.
         before_step: called before each; it may wait.
     """
@@ -125,6 +133,7 @@ class GaussNewton:
     max_step: float = field(default_factory=lambda: ACCURACY.first_step)
     minimum_step: float = 1e-6
     is_near: bool = False
+    is_shared: bool = False
     until: float = np.inf
     before_step: Callable[[], None] | None = None
 
@@ -172,6 +181,14 @@ class GaussNewton:
         """
         return _Search(self, problem, start, near, eta).run()
 
+    def going_on(self, found: SolverResult) -> GaussNewton:
+        """The same from a result, in which neighbours may share noise: then it is sought from the first step on.
+
+        Args:
+            found: the result.
+        """
+        return replace(self, is_shared=found.has_shared_noise)
+
     def has_settled(self, problem: Problem, evaluation: Evaluation, noise: float, eta: Floats | None = None) -> bool:
         """Whether no step would be taken from a trial.
 
@@ -193,7 +210,7 @@ class _Search:
         self, options: GaussNewton, problem: Problem, start: Floats, near: Evaluation | None, eta: Floats | None
     ) -> None:
         self.options, self.whole = options, problem
-        self.problem = problem.unshared
+        self.problem = problem if options.is_shared else problem.unshared
         self.evaluation = _begun(self.problem, start, near)
         self.evaluations, self.limit = 1, self._first_limit
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
@@ -257,6 +274,13 @@ class _Search:
         self.problem, self._at, self.evaluation, self.noise, self.point_noise, self.eta = before  # it fell back to none
         return False
 
+    def _known(self) -> list[Floats]:
+        """Where hyperparameters are sought at first: with shared noise where there was some before, and without."""
+        without = self._without()
+        if self.eta is None or not self.options.is_shared or self.problem.shared is None:
+            return [without]
+        return [self.eta, without]
+
     def _without(self) -> Floats:
         """Where hyperparameters are sought when none is known there: without noise that neighbours share."""
         return without_shared_noise(self.problem, self.noise, self.eta)
@@ -275,7 +299,7 @@ class _Search:
                 self.noise,
                 self.options.graduation,
                 at.jacobian if at is not None and is_there else None,
-                starts or [self._without()],
+                starts or self._known(),
                 self.point_noise,
                 is_held=is_held,
                 linearised_at=at.linearised_at if at is not None and is_there else None,

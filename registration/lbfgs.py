@@ -69,6 +69,10 @@ class LBFGS:
         """The same: it asks nothing of where it starts."""
         return self
 
+    def going_on(self, found: SolverResult) -> LBFGS:
+        """The same: see `GaussNewton.going_on`."""
+        return self
+
     def directly(self) -> LBFGS:
         """The same with the last loss alone."""
         return replace(self, losses=self.losses[-1:])

@@ -38,7 +38,7 @@ def refine(
         last: the exact model's result for the frame before, from which it goes on where forces are sought in the same
             place.
     """
-    solver = setup.options.solver.following()
+    solver = setup.options.solver.following().going_on(draft.solved)
     is_same_place = last is not None and last.draft is not None and last.draft.prepared is draft.prepared
     if last is not None and is_same_place and last.prepared is not draft.prepared:  # else it is the draft itself
         problem = setup.problem(points, last.prepared, last.evaluation.positions, last.rms_distance)

@@ -29,7 +29,7 @@ def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
     if _is_nearer_at_rest(setup, near, last):  # the tool has let go: no way back through all states between
         begun = from_rest(setup, points, prepared, setup.options.solver)
         return finish(setup, points, Localised(prepared, begun))
-    solver = setup.options.solver.following()
+    solver = setup.options.solver.following().going_on(last.solved)
     if _is_as_expected(setup, problem, near, last):
         solver = solver.directly()
     return Ended(prepared, solver.solve(problem, near.coefficients, near, last.eta))

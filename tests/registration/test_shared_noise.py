@@ -80,6 +80,22 @@ def test_its_size_and_length_are_told(body: Body) -> None:
     assert size == pytest.approx(SIZE, rel=0.34) and 0.5 * LENGTH < length < 2.0 * LENGTH
 
 
+def test_a_frame_after_one_with_it_seeks_it_from_its_first_step(body: Body) -> None:
+    """No step is lost to forces that explain it, and states are as near as those of searches from rest."""
+    made, steps, errors = registrar(body), [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        last, fresh = (made.register(shaken(cloud_on(body, truth(body), 400, rng), rng)) for _ in range(2))
+        found = made.track(fresh.problem.cloud, last)
+        assert found.shared_noise is not None and found.judgement.is_usable
+        steps.append((len(found.solved.trace), len(fresh.solved.trace)))
+        errors.append([np.linalg.norm(each.displacement - truth(body), axis=1).mean() for each in (found, fresh)])
+    followed, from_rest = np.sum(steps, axis=0)
+    assert followed < 0.5 * from_rest
+    followed, from_rest = np.median(errors, axis=0)
+    assert followed < 1.3 * from_rest
+
+
 @pytest.mark.slow
 def test_forces_are_as_far_off_as_they_say(body: Body) -> None:
     """Net forces across the beam: z^2 = e' S^-1 e / 2, 0.69 in the median of a right law; a few are far off."""
