@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 from .evaluation import Evaluation
 from .evidence import Conditional, Evidence, LinearProblem
@@ -163,14 +162,9 @@ class LocalModel:
         return self.evidence.conditional(self.eta)
 
     @cached_property
-    def _scaled(self) -> Floats:
-        """The Hessian in coefficients of unit prior variance, (k, k)."""
-        return self.evidence.scaled(self.eta)
-
-    @cached_property
     def _eigen(self) -> tuple[Floats, Floats]:
-        """Of that, for where Cholesky's factor fails."""
-        values, vectors = np.linalg.eigh(self._scaled)
+        """Of the Hessian in coefficients of unit prior variance, for steps that have to be damped."""
+        values, vectors = np.linalg.eigh(self.evidence.scaled(self.eta))
         return values, vectors
 
     def solved(self, right: Floats) -> Floats:
@@ -230,14 +224,10 @@ class LocalModel:
         return other
 
     def _damped(self, damping: float) -> Floats:
+        values, vectors = self._eigen
         root = 1.0 / np.sqrt(self.precision)
-        matrix = self._scaled.copy()
-        matrix.flat[:: len(matrix) + 1] += damping
-        found, failed = dposv(matrix, root * self.gradient, lower=True, overwrite_a=True)[1:]
-        if failed:
-            values, vectors = self._eigen
-            found = vectors @ ((vectors.T @ (root * self.gradient)) / (np.maximum(values, 1.0) + damping))
-        return -root * found
+        rotated = vectors.T @ (root * self.gradient)
+        return -root * (vectors @ (rotated / (values + damping)))
 
     def step(self, limit: float) -> tuple[Floats, float]:
         """The best change of the coefficients that moves no observed node further than the limit, and how far it does.
@@ -248,8 +238,7 @@ class LocalModel:
         change, damping = self._whole, 0.0
         while (largest := self.largest_movement(change)) > 1.05 * limit or self.problem.is_too_far(change):
             self.is_undamped = False
-            further = max(1.6, largest / (1.05 * limit))  # a step is shortened by no more than its damping grows
-            damping = max(further * damping, 1e-8 * float(np.trace(self._scaled)), 0.1)
+            damping = max(1.6 * damping, 1e-8 * self._eigen[0][-1], 0.1)
             change = self._damped(damping)
         return change, largest
 
@@ -258,7 +247,7 @@ class LocalModel:
         if self._law is not None:
             return -float(self.gradient @ change) - 0.5 * self._law.square(change)
         scaled = change * np.sqrt(self.precision)
-        return -float(self.gradient @ change + 0.5 * scaled @ self._scaled @ scaled)
+        return -float(self.gradient @ change + 0.5 * scaled @ self.evidence.scaled(self.eta) @ scaled)
 
     def largest_movement(self, change: Floats) -> float:
         """Largest predicted movement of an observed node, metres."""

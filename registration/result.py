@@ -15,6 +15,7 @@ from .gauss_newton import IterationRecord, SolverResult
 from .local_model import LocalModel
 from .outcome import Outcome
 from .parameters.block import Estimate
+from .policy import POLICY
 from .pose import Pose
 from .posterior import Posterior
 from .prepared import Prepared
@@ -211,7 +212,9 @@ class Registration:
     def shared_noise(self) -> tuple[float, float] | None:
         """Size and length of the noise that neighbours share, metres; None where it is less than any camera's."""
         scales = self.posterior.scales
-        return (scales.shared, scales.length) if self.solved.has_shared_noise else None
+        if self.problem.shared is None or scales.shared < POLICY.noise_minimum:
+            return None
+        return scales.shared, scales.length
 
     @property
     def shared_noise_dominates(self) -> bool:

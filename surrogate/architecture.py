@@ -55,6 +55,14 @@ class Network(nn.Module):
         """
         return Differentiated(self, coordinates)
 
+    def traced(self, coordinates: Tensor) -> Linearisation:
+        """The same by operations of torch alone: for graphs that other programs are given, and for a GPU.
+
+        Args:
+            coordinates: the point, (d,), on any device.
+        """
+        return self.linearised(coordinates)
+
     def with_parameters(self, values: Mapping[str, ArrayLike]) -> Network:
         """The same for a tissue of other parameters.
 

@@ -78,7 +78,7 @@ class Linearised(Value):
 
     def forward(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         """Displacement and Jacobian."""
-        at = self.network.linearised(self.encode @ coefficients)
+        at = self.network.traced(self.encode @ coefficients)
         slopes = self.linear + self._decoded(at.jvp(self.encode))
         return self.offset + self.linear @ coefficients + self._decoded(at.values[:, None])[:, 0], slopes
 

@@ -53,8 +53,9 @@ class Arrays:
         input_scale: (r,).
         output_scale: one number.
         gate: squared length of the scaled input below which the correction fades.
-        enter, leave: the first and the last layer.
+        enter: the first layer.
         pairs: the two layers of each block.
+        leave: the last layer.
         rest: what the blocks give at rest, (r,).
     """
 
@@ -271,12 +272,66 @@ class AveragedNetwork(ReducedNetwork):
         values = super().forward(turned.reshape(-1, modes)).reshape(count, -1, modes)
         return torch.einsum("gij,gsi->sj", self.turns, values) / count
 
-    def linearised(self, coordinates: Tensor, near: Linearisation | None = None) -> LinearisedAverage:
-        """The network at one point, (r,)."""
+    def linearised(self, coordinates: Tensor, near: Linearisation | None = None) -> AverageAtPoint:
+        """The network at one point, (r,), on the processor."""
+        return AverageAtPoint(self, coordinates)
+
+    def traced(self, coordinates: Tensor) -> LinearisedAverage:
+        """See `Network.traced`."""
         return LinearisedAverage(self, coordinates)
 
 
 class LinearisedAverage:
+    """An averaged network at one point in torch, which graphs are made of and a GPU runs, with derivatives by hand.
+
+    Args:
+        network: the network; its weights need no gradient.
+        coordinates: the point, (r,).
+    """
+
+    def __init__(self, network: AveragedNetwork, coordinates: Tensor) -> None:
+        self.network = network
+        self._x = (network.turns @ coordinates) * network.input_scale  # (g, r)
+        self._trace: list[Tensor] = []
+        self._missing = network.blocks(self._x, self._trace) - network.rest
+        self._gate = network.gate(self._x)
+        values = self._gate * self._missing * network.output_scale
+        self.values = (values[:, None] @ network.turns).mean(dim=0)[0]
+
+    @cached_property
+    def _slopes(self) -> tuple[Tensor, Tensor]:
+        """Of the gate, (g, r), zero at rest where the values are zero as well, and of the activations, (b, g, w)."""
+        x, count = self._x, self._x.shape[1]
+        square = x.square().mean(dim=1, keepdim=True)
+        gate = x * (_GATE**2 / count) / (self._gate.clamp_min(_TINY) * (square + _GATE**2) ** 2)
+        z = torch.stack(self._trace)
+        return gate, 0.5 + 0.5 * torch.erf(_ROOT_HALF * z) + z * torch.exp(-0.5 * z * z) * _DENSITY
+
+    def jvp(self, tangents: Tensor) -> Tensor:
+        """Changes of the values, (r, k), for changes of the coordinates, (r, k)."""
+        net = self.network
+        gate, slopes = self._slopes
+        dx = (tangents.T @ net.turns.mT) * net.input_scale  # (g, k, r)
+        hidden = dx @ net.enter.weight.T
+        for slope, (inner, outer) in zip(slopes, net.pairs, strict=True):
+            hidden = hidden + (slope[:, None] * (hidden @ inner.weight.T)) @ outer.weight.T
+        change = self._gate[:, None] * (hidden @ net.leave.weight.T)
+        change += (dx @ gate[:, :, None]) * self._missing[:, None]
+        return ((change * net.output_scale) @ net.turns).mean(dim=0).T
+
+    def vjp(self, cotangent: Tensor) -> Tensor:
+        """Gradient with respect to the coordinates, (r,), for one with respect to the values, (r,)."""
+        net = self.network
+        gate, slopes = self._slopes
+        change = (net.turns @ cotangent) * (net.output_scale / len(net.turns))  # (g, r)
+        hidden = (self._gate * change) @ net.leave.weight
+        for slope, (inner, outer) in zip(slopes.flip(0), reversed(net.pairs), strict=True):
+            hidden = hidden + (slope * (hidden @ outer.weight)) @ inner.weight
+        dx = hidden @ net.enter.weight + gate * (self._missing * change).sum(dim=1, keepdim=True)
+        return ((dx * net.input_scale)[:, None] @ net.turns).sum(dim=0)[0]
+
+
+class AverageAtPoint:
     """An averaged network at one point, with derivatives by hand.
 
     In NumPy, on the network's own memory: at one point torch spends several times as long on being called as on what it

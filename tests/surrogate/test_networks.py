@@ -103,6 +103,17 @@ def test_a_batch_is_its_points(network: Network, point: torch.Tensor) -> None:
     assert (network(batch) - apart).abs().max() < 1e-13 * apart.abs().max()
 
 
+def test_what_graphs_are_made_of_is_what_registers(network: Network, point: torch.Tensor) -> None:
+    own, traced = network.linearised(point), network.traced(point)
+    tangents, cotangent = _drawn(len(point), 3), _drawn(len(own.values), 1)[:, 0]
+    for found, wanted in (
+        (own.values, traced.values),
+        (own.jvp(tangents), traced.jvp(tangents)),
+        (own.vjp(cotangent), traced.vjp(cotangent)),
+    ):
+        assert (found - wanted).abs().max() < 1e-12 * wanted.abs().max()
+
+
 def test_what_is_saved_is_the_network(request: pytest.FixtureRequest, network: Network, point: torch.Tensor) -> None:
     settings = SETTINGS[request.node.callspec.params["objective"]]
     from_state_dict = settings.from_state_dict({name: tensor.clone() for name, tensor in network.state_dict().items()})
