@@ -10,7 +10,7 @@ from .compiled import IS_COMPILED, compiled
 
 
 def product(rows: csr_array, dense: Floats) -> Floats:
-    """The rows times dense columns, (q, k): SciPy's product, in about half of its time where numba is installed.
+    """The rows times dense columns, (q, k): SciPy's product, sooner where numba is installed.
 
     Args:
         rows: (q, n).

@@ -159,7 +159,7 @@ def by_scale(local: LocalModel) -> Floats:
 def by_rigid_motion(local: LocalModel) -> Floats:
     """Derivative of the distances by a turn, radians, and a shift, metres, of the cloud about its middle, (p, 6)."""
     normals, arms, motion = local.evaluation.match.directions, _arms(local), np.empty((len(local.weights), 6))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # NumPy's cross product takes three times as long
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # the cross product, written out
         motion[:, i] = arms[:, k] * normals[:, j] - arms[:, j] * normals[:, k]
     motion[:, 3:] = -normals
     return motion

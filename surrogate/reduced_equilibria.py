@@ -395,7 +395,7 @@ class GalerkinNetwork(Network):
         moduli = self._moduli(q) * read.weights[:, None, None]
         if exact:
             return read.flat.T @ np.matmul(moduli, read.flat.reshape(-1, 9, size)).reshape(-1, size) + read.support
-        # In single precision torch's products take two thirds of the time of NumPy's.
+        # In single precision torch's products are the faster ones.
         bent = torch.bmm(torch.from_numpy(moduli.astype(np.float32)), torch.from_numpy(read.slopes))
         found: Floats = (torch.from_numpy(read.turned) @ bent.reshape(-1, size)).numpy().astype(np.float64)
         return found + read.support
