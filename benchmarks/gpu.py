@@ -1,7 +1,9 @@
 """The fast path on a GPU: equilibria, training, accuracy, latency and memory, from one tensors file, with torch alone.
 
     softtwin tensors beam/organ.toml beam.safetensors --precision double --no-jacobians
-    python benchmarks/gpu.py beam.safetensors OUTPUT [--device cuda] [--small] [--minutes 8] [--only PHASE ...]
+    python benchmarks/gpu_frames.py TWIN frames
+    python benchmarks/gpu.py beam.safetensors OUTPUT [--frames frames] [--device cuda] [--small] [--minutes 8]
+                             [--only PHASE ...]
 
 It asks for torch, NumPy, SciPy, safetensors and Lightning; no Zarr, VTK or FEniCSx. Phases run in the order of their
 worth; each is written into OUTPUT/gpu.json when it is finished, and the same command goes on with those missing.
@@ -28,10 +30,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors.numpy import load_file
 
 from softtwin.meshes.metrics import nodal_distances, thesis_error
 from softtwin.reference.data.dataset import DataSet, Samples, Split
 from softtwin.reference.data.samplers import LoadPlan, draw_load
+from softtwin.registration.device.arrays import DeviceArrays, Start
+from softtwin.registration.device.frames import DeviceFrames, Frames
 from softtwin.surrogate.architecture import Architecture
 from softtwin.surrogate.equilibria import Equilibria, NewtonSettings
 from softtwin.surrogate.equilibria_layer import EquilibriaLayer
@@ -395,12 +400,105 @@ def elastic(data: DataSet, device: str, count: int, calls: int) -> dict[str, Any
     return {"states": count, **taken, "states_per_s": 1e3 * count / taken["median_ms"], "precision": "double"}
 
 
+def frames_of(folder: Path, name: str) -> tuple[DeviceArrays, dict[str, Floats]]:
+    """What `gpu_frames.py` has made."""
+    return DeviceArrays.load(folder / f"{name}.arrays.safetensors"), load_file(folder / f"{name}.clouds.safetensors")
+
+
+def far_off(found: Floats, truth: Floats) -> dict[str, float]:
+    """Largest distance of a node in each of several states, (s, n, 3), metres: its spread."""
+    return asdict(spread(np.linalg.norm(found - truth, axis=2).max(axis=1)))
+
+
+def frames_tracked(folder: Path, device: str, repeats: int, few: int | None) -> dict[str, Any]:
+    """Frames of a sequence, each from the one before: host to host, and how far from the processor's."""
+    arrays, given = frames_of(folder, "tracked")
+    count = min(few or len(given["clouds"]), len(given["clouds"]))
+    starts = [Start(*(given[name][i : i + 1] for name in ("coefficients", "eta", "moved"))) for i in range(count)]
+
+    def registered(frames: DeviceFrames) -> list[Frames]:
+        return [frames.register(given["clouds"][i : i + 1], starts[i]) for i in range(count)]
+
+    def of(found: list[Frames], name: str) -> Floats:
+        return np.concatenate([getattr(each, name) for each in found])
+
+    points = given["clouds"].shape[1]
+    alone = registered(DeviceFrames(arrays, 1, points, "cpu"))
+    found: dict[str, Any] = {
+        "frames": count,
+        "points": points,
+        "nodes": len(arrays.nodes),
+        "triangles": len(arrays.triangles),
+        "unknowns": arrays.coefficient_count,
+        "iterations": float(np.mean([each.iterations for each in alone])),
+        "processor": latency(lambda: registered(DeviceFrames(arrays, 1, points, "cpu"))[0], 1),
+    }
+    close = DeviceFrames(arrays, 1, points, device, settled=1e-4)
+    found["off_from_registrar_m"] = far_off(of(registered(close), "displacement"), given["displacement"][:count])
+    for has_graphs in (True, False) if device == "cuda" else (False,):
+        began = time.monotonic()
+        frames = DeviceFrames(arrays, 1, points, device, has_graphs=has_graphs)
+        here = registered(frames)  # captured and compiled
+        prepared = time.monotonic() - began
+        times = [
+            latency(partial(frames.register, given["clouds"][i : i + 1], starts[i]), repeats) for i in range(count)
+        ]
+        found["with_graphs" if has_graphs else "without_graphs"] = {
+            "prepared_s": prepared,
+            "median_ms": float(np.median([each["median_ms"] for each in times])),
+            "p95_ms": float(np.max([each["p95_ms"] for each in times])),
+            "iterations": float(np.mean([each.iterations for each in here])),
+            "has_converged": int(of(here, "has_converged").sum()),
+            "off_from_processor_m": far_off(of(here, "displacement"), of(alone, "displacement")),
+            "margin_off_from_processor_m": float(np.abs(of(here, "margin") - of(alone, "margin")).max()),
+            "error_m": asdict(
+                spread(np.linalg.norm(of(here, "displacement") - given["truth"][:count], axis=2).mean(axis=1))
+            ),
+        }
+    return found
+
+
+def frames_together(folder: Path, device: str, calls: int, few: int | None) -> dict[str, Any]:
+    """States that have nothing to do with each other in one batch: from rest, then from where that has ended."""
+    arrays, given = frames_of(folder, "rest")
+    clouds, truth = given["clouds"][:few], given["truth"][:few]
+    if device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    frames = DeviceFrames(arrays, len(clouds), clouds.shape[1], device)
+    found = frames.register(clouds)
+
+    def told(displacement: Floats, margin: Floats) -> dict[str, Any]:
+        missed = np.linalg.norm(displacement - truth, axis=2)
+        return {
+            "error_m": asdict(spread(missed.mean(axis=1))),
+            "nodes_within_95_margins": float(np.mean(missed <= np.nan_to_num(margin) + 1e-12)),
+        }
+
+    return {
+        "states": len(clouds),
+        "from_rest": {
+            **latency(lambda: frames.register(clouds), calls),
+            "iterations": found.iterations,
+            "has_converged": int(found.has_converged.sum()),
+            "may_share_noise": int(found.may_share_noise.sum()),
+            **told(found.displacement, found.margin),
+        },
+        "tracked": latency(lambda: frames.register(clouds, found.start), calls),
+        "registrar": {
+            "seconds": float(given["seconds"][0]),
+            **told(given["displacement"][:few], given["margin"][:few]),
+        },
+        "memory_mib": torch.cuda.max_memory_allocated() / 2**20 if device == "cuda" else None,
+    }
+
+
 def main() -> None:
     """All phases."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("data", type=Path, help="tensors file of a body of hexahedra")
     parser.add_argument("output", type=Path, help="folder of gpu.json")
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    parser.add_argument("--frames", type=Path, help="folder that gpu_frames.py has made; without it no frames")
     parser.add_argument("--small", action="store_true", help="tiny networks and few calls")
     parser.add_argument("--only", nargs="*", help="phases; all if not given")
     parser.add_argument("--minutes", type=float, default=8.0, help="no phase begins after them")
@@ -422,8 +520,16 @@ def main() -> None:
             "prediction": prediction(surrogate, data, chosen.device, calls // 10 if row.large else calls, row.large),
         }
 
+    with_frames: dict[str, Callable[[], Any]] = {}
+    if chosen.frames is not None:
+        counts = (1, 2) if chosen.small else (10, None)
+        with_frames = {
+            "frames_tracked": lambda: frames_tracked(chosen.frames, chosen.device, *counts),
+            "frames_together": lambda: frames_together(chosen.frames, chosen.device, *counts),
+        }
     phases: dict[str, Callable[[], Any]] = {
         "environment": lambda: environment(data, chosen.device),
+        **with_frames,
         "equilibria": lambda: equilibria(data, chosen.device, few if chosen.small else None),
         "derivatives": lambda: derivatives(data, chosen.device, few if chosen.small else 256),
         "generation": lambda: made(16 if chosen.small else THESIS_SAMPLES)[1],

@@ -71,13 +71,13 @@ class SurfaceDistance:
         self._weights = None if surface.weights is None else surface.weights[vertices][:, self.nodes]
         self._tree = TriangleTree(self.rest, self.triangles)
 
-    def _carried(self, field: Floats) -> Floats:
+    def carried(self, field: Floats) -> Floats:
         """A field of the nodes `nodes`, (m, ...), at the vertices of the observed side, (v, ...)."""
         return field if self._weights is None else self._weights @ field
 
     def at_points(self, match: Correspondence, field: Floats) -> Floats:
         """A number of each node of `nodes`, (m,), at the closest points of a match, (p,)."""
-        corners = self._carried(field)[self.triangles[match.triangles]]
+        corners = self.carried(field)[self.triangles[match.triangles]]
         found: Floats = np.einsum("pk,pk->p", match.weights, corners)
         return found
 
@@ -104,7 +104,7 @@ class SurfaceDistance:
             cloud: points, (p, 3), metres.
             near: the same cloud on the surface where it was nearby, which makes the search shorter.
         """
-        positions = self.rest + self._carried(displacement)
+        positions = self.rest + self.carried(displacement)
         triangles, weights = self._tree.closest(positions, cloud, None if near is None else near.triangles)
         vertices = self.triangles[triangles]
         distances, directions = signed_distances(positions, vertices, weights, cloud, 1e-12 * self.body.size)
@@ -118,7 +118,7 @@ class SurfaceDistance:
             match: of a cloud.
             displacement: of the nodes `nodes`, (m, 3), metres.
         """
-        return _normals((self.rest + self._carried(displacement))[self.triangles[match.triangles]])[0]
+        return _normals((self.rest + self.carried(displacement))[self.triangles[match.triangles]])[0]
 
     def facing_rows(self, match: Correspondence, displacement: Floats, along: Floats) -> csr_array:
         """Derivative of these normals' components along vectors, (p q, 3m), by the displacement of the nodes.
@@ -130,7 +130,7 @@ class SurfaceDistance:
             displacement: of the nodes `nodes`, (m, 3), metres.
             along: q vectors for each point, (p, q, 3).
         """
-        corners = (self.rest + self._carried(displacement))[self.triangles[match.triangles]]
+        corners = (self.rest + self.carried(displacement))[self.triangles[match.triangles]]
         normals, doubled = _normals(corners)
         first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         # t . dn = q . (d first x second + first x d second) with q = (t - (t . n) n) / |first x second|
@@ -152,7 +152,7 @@ class SurfaceDistance:
 
     def moved_closest_points(self, match: Correspondence, displacement: Floats) -> Floats:
         """Where the closest points of a match at rest are after a displacement of `nodes`, (m, 3): (p, 3), metres."""
-        corners = (self.rest + self._carried(displacement))[self.triangles[match.triangles]]
+        corners = (self.rest + self.carried(displacement))[self.triangles[match.triangles]]
         found: Floats = np.einsum("pk,pki->pi", match.weights, corners)
         return found
 
@@ -190,7 +190,7 @@ class SurfaceDistance:
 
     def curvature(self, match: Correspondence) -> Floats:
         """Mean curvature of the observed side at rest at the closest points of a match, (p,), 1/m."""
-        return self.at_vertices(match, self._curvature)
+        return self.at_vertices(match, self.vertex_curvature)
 
     @cached_property
     def edge(self) -> float:
@@ -199,7 +199,8 @@ class SurfaceDistance:
         return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
 
     @cached_property
-    def _curvature(self) -> Floats:
+    def vertex_curvature(self) -> Floats:
+        """Mean curvature of the observed side at rest at its vertices, (v,), 1/m."""
         return mean_curvature(Surface(self.rest, self.triangles))
 
     @cached_property

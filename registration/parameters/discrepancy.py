@@ -52,7 +52,7 @@ class ModelError(FieldBlock):
         """The same for another largest displacement, metres."""
         other = copy.copy(self)
         other.amplitude = amplitude
-        other.__dict__.pop("rest", None)
+        other.__dict__.pop("remainder", None)
         return other
 
     @cached_property
