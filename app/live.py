@@ -19,6 +19,7 @@ from .export import WRITTEN, Exporter
 from .landmarks import LandmarkFiles
 from .record import Recorder, counts, describe
 from .register import Scene, Start, check_any, check_budget, name_of, registered, say_coordinates
+from .searching import searching
 from .sources import check_idle, opened
 from .streams import Clock, Mailbox
 from .twin import Camera, Learner, Sequence, Twin
@@ -92,7 +93,8 @@ def register_live(
     if frame_landmarks is not None:
         frame_landmarks.check(twin)
     with (
-        closing(Sequence(twin, zone, camera, is_live=True, learner=learner)) as sequence,
+        searching(twin) as search,
+        closing(Sequence(twin, zone, camera, is_live=True, learner=learner, search=search)) as sequence,
         Recorder(Exporter(twin, output, formats), zone) as recorder,
     ):
         for answer in answers(sequence, box, budget, frame_landmarks=frame_landmarks):

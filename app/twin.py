@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -44,6 +44,7 @@ from softtwin.registration.residuals.landmarks import LandmarkPairs
 from softtwin.registration.residuals.term import ResidualTerm
 from softtwin.registration.result import Registration
 from softtwin.registration.rigid import align
+from softtwin.registration.strategies.resuming import Found
 from softtwin.registration.surface_distance import SurfaceDistance
 from softtwin.registration.tracker import Tracker
 from softtwin.registration.verdict import Judgement, Verdict
@@ -624,7 +625,10 @@ class Twin:
 
 @dataclass(frozen=True, eq=False)
 class TwinWays:
-    """A cloud from rest or from the last frame, as `Tracker` asks for it; the arguments are those of `Twin.ways`."""
+    """A cloud from rest or from the last frame, as `Tracker` asks for it; the arguments are those of `Twin.ways`.
+
+    Beside the frames `search` is asked for what has to be found from rest, where it is there and no landmarks pull.
+    """
 
     twin: Twin
     zone: str | None
@@ -632,6 +636,7 @@ class TwinWays:
     until: float
     landmarks: Landmarks | None
     terms: tuple[ResidualTerm, ...] = ()
+    search: Searches | None = None
     before_step: Callable[[], None] | None = None
 
     def beside(self, before_step: Callable[[], None]) -> TwinWays:
@@ -644,7 +649,18 @@ class TwinWays:
 
     def follow(self, cloud: ArrayLike, last: Registration | None) -> Registration:
         """From the last state, and from rest where that is not accepted: see `Registrar.follow`."""
+        if last is None and self.search is not None and self.before_step is not None and self._is_plain:
+            with suppress(SearchEnded):  # then it is searched for here
+                found = self.search.found(cloud, self.zone, self.camera, self.before_step)
+                if found is None:
+                    raise NotConverged("the search from rest has found no state of use")
+                return self._run(cloud, lambda engine, points: _registrar(engine).resumed(points, found))
         return self._run(cloud, lambda engine, points: engine.follow(points, last))
+
+    @property
+    def _is_plain(self) -> bool:
+        """Whether clouds are all that pulls."""
+        return self.landmarks is None and not self.terms
 
     def is_lost(self, found: Registration, last: Registration) -> bool:
         """Whether what was tracked has to be searched for from rest: see `Registrar.is_lost`."""
@@ -685,6 +701,21 @@ class Learner(Protocol):
         """After a frame: what was found."""
 
 
+class SearchEnded(RuntimeError):  # noqa: N818 - a way to end
+    """Who searches from rest has ended."""
+
+
+class Searches(Protocol):
+    """Who searches from rest elsewhere: see `softtwin.app.searching.SearchProcess`."""
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it can be asked."""
+
+    def found(self, cloud: ArrayLike, zone: str | None, camera: Camera, wait: Callable[[], None]) -> Found | None:
+        """What it finds for a cloud; None where that is of no use."""
+
+
 class Sequence:
     """Frames of one twin, each registered from what the last usable one found.
 
@@ -695,6 +726,7 @@ class Sequence:
         is_live: no answer waits for a search from rest, which a twin whose model is a network does beside the frames;
             what is found when depends on time then.
         learner: is told of each frame, and may renew the twin between two of them; none if not given.
+        search: searches from rest in place of a thread beside the frames; none if not given.
     """
 
     def __init__(
@@ -705,8 +737,9 @@ class Sequence:
         *,
         is_live: bool = False,
         learner: Learner | None = None,
+        search: Searches | None = None,
     ) -> None:
-        self.twin, self.zone, self.camera, self._learner = twin, zone, camera, learner
+        self.twin, self.zone, self.camera, self._learner, self._search = twin, zone, camera, learner, search
         self._count = 0
         engine = twin.registrar(zone)  # a zone that is not there is said before the first cloud
         is_concurrent = isinstance(engine, Registrar) and bool(getattr(engine.model, "is_concurrent", False))
@@ -742,7 +775,10 @@ class Sequence:
             points = given.array()
             if self.camera == "align":
                 self.camera = self.twin.aligned(points)
-            result = self._tracker.take(points, self.twin.ways(self.zone, self.camera, until, landmarks, terms))
+            ways = self.twin.ways(self.zone, self.camera, until, landmarks, terms)
+            if self._search is not None and self._search.is_ready:
+                ways = replace(ways, search=self._search)
+            result = self._tracker.take(points, ways)
         except (CloudError, NotConverged) as error:
             return self.refuse(str(error), time.perf_counter() - begin)
         count = 0 if landmarks is None else len(np.asarray(landmarks[0]))

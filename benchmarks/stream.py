@@ -2,6 +2,7 @@
 
     softtwin quickstart --output FOLDER
     python benchmarks/stream.py FOLDER [--seconds 600] [--rate 60] [--budget 0.1] [--engine surrogate]
+                                       [--searches thread]
 
 The organ moves slowly between states under loads of its kind (solved by the reference beforehand); each cloud has
 1,000 points and 0.5 mm of noise and is made before the stream begins. No zone is told, no files are written.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from summaries import resident_mib
 
 from softtwin.app.live import answers
 from softtwin.app.quickstart import CAMERA, NOISE, POINTS
+from softtwin.app.searching import searching
 from softtwin.app.streams import fed
 from softtwin.app.twin import Sequence, Twin
 from softtwin.meshes.clouds import partial_view
@@ -47,10 +50,15 @@ def clouds_of(twin: Twin, path: list[Floats]) -> list[Floats]:
 
 def work(row: str, given: Given) -> dict[str, Any]:
     path = path_of(given.folder)
-    with Twin.open(given.folder, given.engine, pose="fixed") as twin:
+    with (
+        Twin.open(given.folder, given.engine, pose="fixed") as twin,
+        searching(twin) if given.searches == "process" else nullcontext() as search,
+        closing(Sequence(twin, "", is_live=True, search=search)) as sequence,
+    ):
         clouds = clouds_of(twin, path)
-        sequence = Sequence(twin, "", is_live=True)
         sequence.register(clouds[0])  # everything is prepared
+        while search is not None and not search.is_ready:
+            time.sleep(0.1)
         begun: list[float] = []
 
         def camera() -> Iterator[Floats]:
@@ -74,7 +82,7 @@ def work(row: str, given: Given) -> dict[str, Any]:
                 memory.append((len(ages), resident_mib()))
         memory.append((len(ages), resident_mib()))
     return {
-        **{name: getattr(given, name) for name in ("seconds", "rate", "budget", "engine")},
+        **{name: getattr(given, name) for name in ("seconds", "rate", "budget", "engine", "searches")},
         "clouds": len(begun),
         "answers": len(ages),
         "dropped": dropped,
@@ -99,6 +107,7 @@ BENCHMARK = Benchmark(
         "rate": Setting(60.0, "clouds a second"),
         "budget": Setting(0.1, "seconds"),
         "engine": Setting("surrogate"),
+        "searches": Setting("process", "from rest, beside the frames", choices=("process", "thread")),
     },
     seeds=(0,),
     small={"seconds": 3.0},

@@ -32,6 +32,7 @@ from .setup import Ended, Setup
 from .strategies.cold_start import finish, localise
 from .strategies.elsewhere import compared, is_missed
 from .strategies.refinement import refine
+from .strategies.resuming import Found, resume
 from .strategies.tracking import has_left, track
 from .surface_distance import SurfaceDistance
 from .tracker import Tracker
@@ -194,6 +195,19 @@ class Registrar:
         """
         begin = time.perf_counter()
         return self._concluded(track(self.setup, self.setup.checked(cloud), last), begin)
+
+    def resumed(self, cloud: ArrayLike, found: Found) -> Registration:
+        """A cloud from what another process has found for it: see `strategies.resuming`.
+
+        Args:
+            cloud: observed points, (p, 3), metres.
+            found: for it.
+
+        Raises:
+            CloudError, NotConverged: as for `register`.
+        """
+        begin = time.perf_counter()
+        return self._concluded(resume(self.setup, self.setup.checked(cloud), found), begin)
 
     def is_lost(self, found: Registration, last: Registration) -> bool:
         """Whether what was tracked has to be searched for from rest: it is not accepted, or met much worse.
