@@ -204,12 +204,12 @@ class ReducedNetwork(Network):
         return self.gate(x) * (values[:-1] - values[-1:]) * self.output_scale
 
     def gate(self, x: Tensor) -> Tensor:
-        """t(x), (s, 1), for scaled inputs, (s, r)."""
-        size = torch.linalg.vector_norm(x, dim=1, keepdim=True)  # whose derivative at zero is zero
-        return size * (size * size + x.shape[1] * _GATE**2).rsqrt()
+        """t(x), (..., 1), for scaled inputs, (..., r)."""
+        size = torch.linalg.vector_norm(x, dim=-1, keepdim=True)  # whose derivative at zero is zero
+        return size * (size * size + x.shape[-1] * _GATE**2).rsqrt()
 
     def blocks(self, x: Tensor, trace: list[Tensor] | None = None) -> Tensor:
-        """M(x), (s, r), for scaled inputs, (s, r); a trace collects what the activations are given."""
+        """M(x), (..., r), for scaled inputs, (..., r); a trace collects what the activations are given."""
         linear, gelu = nn.functional.linear, nn.functional.gelu  # calling modules costs as much as what they do here
         hidden = linear(x, self.enter.weight, self.enter.bias)
         for inner, outer in self.pairs:
@@ -282,50 +282,49 @@ class AveragedNetwork(ReducedNetwork):
 
 
 class LinearisedAverage:
-    """An averaged network at one point in torch, which graphs are made of and a GPU runs, with derivatives by hand.
+    """An averaged network at a point in torch, which graphs are made of and a GPU runs, with derivatives by hand.
 
     Args:
         network: the network; its weights need no gradient.
-        coordinates: the point, (r,).
+        coordinates: the point, (r,), or several at once, (s, r): then all results have s in front.
     """
 
     def __init__(self, network: AveragedNetwork, coordinates: Tensor) -> None:
         self.network = network
-        self._x = (network.turns @ coordinates) * network.input_scale  # (g, r)
+        self._x = (network.turns @ coordinates[..., None, :, None])[..., 0] * network.input_scale  # (g, r)
         self._trace: list[Tensor] = []
         self._missing = network.blocks(self._x, self._trace) - network.rest
         self._gate = network.gate(self._x)
         values = self._gate * self._missing * network.output_scale
-        self.values = (values[:, None] @ network.turns).mean(dim=0)[0]
+        self.values = (values[..., None, :] @ network.turns).mean(dim=-3)[..., 0, :]
 
-    @cached_property
-    def _slopes(self) -> tuple[Tensor, Tensor]:
-        """Of the gate, (g, r), zero at rest where the values are zero as well, and of the activations, (b, g, w)."""
-        x, count = self._x, self._x.shape[1]
-        square = x.square().mean(dim=1, keepdim=True)
+    def _slopes(self) -> tuple[Tensor, list[Tensor]]:
+        """Of the gate, (g, r), zero at rest where the values are zero as well, and of each activation, (g, w)."""
+        x, count = self._x, self._x.shape[-1]
+        square = x.square().mean(dim=-1, keepdim=True)
         gate = x * (_GATE**2 / count) / (self._gate.clamp_min(_TINY) * (square + _GATE**2) ** 2)
-        z = torch.stack(self._trace)
-        return gate, 0.5 + 0.5 * torch.erf(_ROOT_HALF * z) + z * torch.exp(-0.5 * z * z) * _DENSITY
+        bent = [0.5 + 0.5 * torch.erf(_ROOT_HALF * z) + z * torch.exp(-0.5 * z * z) * _DENSITY for z in self._trace]
+        return gate, bent
 
     def jvp(self, tangents: Tensor) -> Tensor:
         """Changes of the values, (r, k), for changes of the coordinates, (r, k)."""
         net = self.network
-        gate, slopes = self._slopes
+        gate, slopes = self._slopes()
         dx = (tangents.T @ net.turns.mT) * net.input_scale  # (g, k, r)
         hidden = dx @ net.enter.weight.T
         for slope, (inner, outer) in zip(slopes, net.pairs, strict=True):
-            hidden = hidden + (slope[:, None] * (hidden @ inner.weight.T)) @ outer.weight.T
-        change = self._gate[:, None] * (hidden @ net.leave.weight.T)
-        change += (dx @ gate[:, :, None]) * self._missing[:, None]
-        return ((change * net.output_scale) @ net.turns).mean(dim=0).T
+            hidden = hidden + (slope[..., None, :] * (hidden @ inner.weight.T)) @ outer.weight.T
+        change = self._gate[..., None, :] * (hidden @ net.leave.weight.T)
+        change = change + (dx @ gate[..., None]) * self._missing[..., None, :]
+        return ((change * net.output_scale) @ net.turns).mean(dim=-3).mT
 
     def vjp(self, cotangent: Tensor) -> Tensor:
-        """Gradient with respect to the coordinates, (r,), for one with respect to the values, (r,)."""
+        """Gradient with respect to the coordinates, (r,), for one with respect to the values, (r,), at one point."""
         net = self.network
-        gate, slopes = self._slopes
+        gate, slopes = self._slopes()
         change = (net.turns @ cotangent) * (net.output_scale / len(net.turns))  # (g, r)
         hidden = (self._gate * change) @ net.leave.weight
-        for slope, (inner, outer) in zip(slopes.flip(0), reversed(net.pairs), strict=True):
+        for slope, (inner, outer) in zip(reversed(slopes), reversed(net.pairs), strict=True):
             hidden = hidden + (slope * (hidden @ outer.weight)) @ inner.weight
         dx = hidden @ net.enter.weight + gate * (self._missing * change).sum(dim=1, keepdim=True)
         return ((dx * net.input_scale)[:, None] @ net.turns).sum(dim=0)[0]

@@ -34,16 +34,17 @@ class ClosestPoints:
         triangles: corners, (t, 3).
         touching: as near as that, a point is on the surface, metres.
         device: where.
+        is_fused: what calls it is compiled, and no distance of a pair is written down; else some points at a time.
     """
 
-    def __init__(self, triangles: Tensor, touching: float, device: str) -> None:
+    def __init__(self, triangles: Tensor, touching: float, device: str, is_fused: bool = False) -> None:
         self.triangles, self.touching = triangles.to(device), touching
-        self._nearest = torch.compile(_nearest, dynamic=False) if device == "cuda" else _in_chunks
+        self._is_fused = device == "cuda" and is_fused
 
     def match(self, positions: Tensor, clouds: Tensor) -> Match:
         """Clouds, (b, p, 3), on surfaces with vertices at positions, (b, v, 3), metres."""
         corners = positions[:, self.triangles]  # (b, t, corner, axis)
-        chosen = self._nearest(corners, clouds)
+        chosen = _nearest(corners, clouds) if self._is_fused else _in_chunks(corners, clouds)
         own = torch.take_along_dim(corners, chosen[:, :, None, None], dim=1)
         weights = _weights(own, clouds)
         offsets = (weights[..., None] * own).sum(dim=2) - clouds
@@ -58,6 +59,7 @@ class ClosestPoints:
 
 
 def _in_chunks(corners: Tensor, clouds: Tensor) -> Tensor:
+    """`_nearest`, some points at a time."""
     parts = clouds.split(max(1, _CHUNK // (corners.shape[0] * corners.shape[1])), dim=1)
     return torch.cat([_nearest(corners, part) for part in parts], dim=1)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -24,9 +24,10 @@ from ..policy import ACCURACY, POLICY
 from .arrays import DeviceArrays, Start
 from .conclusion import Concluded, Conclusion
 from .evidence import NOISE
-from .operations import Operations, blank, copied, mapped
+from .operations import Operations, Search, blank, copied, mapped
 
 Floats = NDArray[np.float64]
+Execution = Literal["compiled", "graphs", "eager"]
 _WARM_UP = 2  # runs before a capture, as CUDA asks for
 
 
@@ -74,12 +75,14 @@ class DeviceFrames:
         points: most points of a cloud.
         device: `cpu` or `cuda`.
         confidence: of the margins.
-        has_graphs: replay CUDA graphs; else each operation is started by itself.
+        execution: of the operations on a GPU: `compiled`, fused by torch.compile (a minute or more at the first call)
+            and replayed from CUDA graphs; `graphs`, replayed alone; `eager`, each of some thousand started by itself.
+            On a processor always the last.
         settled: where a search has ended, see `policy.ACCURACY`.
 
     Raises:
-        ValueError: fewer than one cloud, or points than a cloud has to have; another confidence; a GPU that torch does
-            not see.
+        ValueError: fewer than one cloud, or points than a cloud has to have; another confidence or execution; a GPU
+            that torch does not see.
     """
 
     def __init__(
@@ -90,7 +93,7 @@ class DeviceFrames:
         device: str = "cpu",
         *,
         confidence: float = 0.95,
-        has_graphs: bool = True,
+        execution: Execution = "compiled",
         settled: float = ACCURACY.settled,
     ) -> None:
         if batch < 1 or points < POLICY.minimum_points:
@@ -100,18 +103,26 @@ class DeviceFrames:
             )
         if not 0.0 < confidence < 1.0:
             raise ValueError(f"DeviceFrames.confidence: expected a number in (0, 1), got {confidence}.")
+        if execution not in get_args(Execution):
+            raise ValueError(f"DeviceFrames.execution: expected one of {get_args(Execution)}, got {execution!r}.")
         if device == "cuda" and not torch.cuda.is_available():
             raise ValueError(
                 f"DeviceFrames.device: expected a GPU that torch can use, found none (torch {torch.__version__})."
             )
         self.arrays, self.batch, self.points, self._settled = arrays, batch, points, settled
-        self._operations = Operations(arrays, device)
+        is_fused = device == "cuda" and execution == "compiled"
+        self._operations = Operations(arrays, device, is_fused)
         self._conclusion = Conclusion(self._operations, confidence)
         self._clouds = torch.zeros(batch, points, 3, dtype=torch.float64, device=device)
         self._is_point = torch.zeros(batch, points, dtype=torch.bool, device=device)
         self._moved = torch.ones(batch, dtype=torch.float64, device=device)
         self._search = blank(arrays, self._operations.groups, batch, points, device)
-        self._graphs: dict[str, tuple[Any, Any]] | None = {} if device == "cuda" and has_graphs else None
+        self._graphs: dict[str, tuple[Any, Any]] | None = {} if device == "cuda" and execution != "eager" else None
+        self._iteration: Callable[..., Search] = self._operations.iteration
+        self._concluded: Callable[..., Concluded] = self._conclusion.concluded
+        if is_fused:
+            self._iteration = torch.compile(self._iteration, fullgraph=True, dynamic=False)
+            self._concluded = torch.compile(self._concluded, fullgraph=True, dynamic=False)
 
     def register(self, clouds: Sequence[ArrayLike], start: Start | None = None) -> Frames:
         """The states that bring the observed side to clouds.
@@ -166,12 +177,12 @@ class DeviceFrames:
         return iterations
 
     def _iterate(self) -> Tensor:
-        made = self._operations.iteration(self._search, self._clouds, self._is_point, self._moved, self._settled)
+        made = self._iteration(self._search, self._clouds, self._is_point, self._moved, self._settled)
         copied(self._search, made)
         return self._search.has_ended
 
     def _conclude(self) -> Concluded:
-        return self._conclusion.concluded(self._search.local, self._is_point, self._moved)
+        return self._concluded(self._search.local, self._is_point, self._moved)
 
     def _run(self, name: str, work: Callable[[], Any]) -> Any:
         """Work on memory that stays where it is: captured the first time, and replayed."""

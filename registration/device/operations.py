@@ -132,9 +132,10 @@ class Operations:
     Args:
         arrays: see `DeviceFrames`.
         device: see there.
+        is_fused: what is done is compiled.
     """
 
-    def __init__(self, arrays: DeviceArrays, device: str) -> None:
+    def __init__(self, arrays: DeviceArrays, device: str, is_fused: bool = False) -> None:
         self.forces, self.pose, self.patterns, self.rest_part = arrays.parts
         f = self.forces.stop
 
@@ -154,7 +155,7 @@ class Operations:
         self.whole = put(np.hstack([arrays.whole_linear, arrays.whole_decode, arrays.whole_patterns]))
         self.variances = put(arrays.shared_variances)
         self.force_patterns = put(arrays.force_patterns)
-        self.closest = ClosestPoints(put(arrays.triangles, torch.int64), 1e-12 * float(arrays.size), device)
+        self.closest = ClosestPoints(put(arrays.triangles, torch.int64), 1e-12 * float(arrays.size), device, is_fused)
         self.watched = slice(None, None, max(1, len(arrays.rest) // ACCURACY.watched))
         self.groups = ACCURACY.groups if arrays.deviation.any() else 1
         slopes = np.zeros((3, arrays.coefficient_count))
@@ -182,14 +183,8 @@ class Operations:
 
     def network_at(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Values, (b, e), and their derivative by the forces' coefficients, (b, e, f)."""
-        encode = self.encode.float()
-
-        def one(at: Tensor) -> tuple[Tensor, Tensor]:
-            there = self.network.traced(at)
-            return there.values, there.jvp(encode)
-
-        coordinates = (coefficients[:, self.forces] @ self.encode.T).float()
-        values, slopes = torch.vmap(one)(coordinates)
+        at = self.network.traced((coefficients[:, self.forces] @ self.encode.T).float())
+        values, slopes = at.values, at.jvp(self.encode.float())
         return values.double(), slopes.double()
 
     def columns(self, coefficients: Tensor, values: Tensor, moved: Tensor) -> Tensor:

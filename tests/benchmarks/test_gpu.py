@@ -87,7 +87,7 @@ def test_every_phase_runs_without_a_gpu_and_goes_on_where_it_stopped(tmp_path: P
     assert found["equilibria"]["double"]["not_converged"] == 0
     assert found["equilibria"]["double"]["off_from_reference"]["max"] < 1e-7
     assert found["derivatives"]["off_from_processor"] == {"forces": 0.0, "young_modulus": 0.0}
-    assert found["frames_tracked"]["without_graphs"]["off_from_processor_m"]["max"] == 0.0
+    assert found["frames_tracked"]["eager"]["off_from_processor_m"]["max"] == 0.0
     assert found["frames_together"]["states"] == 2
     absent = subprocess.run([*words[:-1], "cuda"], capture_output=True, text=True, check=False)
     assert absent.returncode == 0 or "expected a GPU that torch can use, found none" in absent.stderr

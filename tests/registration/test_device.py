@@ -18,7 +18,7 @@ from softtwin.registration import evidence as one_by_one
 from softtwin.registration.device.arrays import DeviceArrays, Start
 from softtwin.registration.device.closest import ClosestPoints
 from softtwin.registration.device.evidence import Hyperpriors, Sums, eigen, law_of, scale_covariance, scored, slope_of
-from softtwin.registration.device.frames import DeviceFrames, Frames
+from softtwin.registration.device.frames import DeviceFrames, Execution, Frames
 from softtwin.registration.device.from_registration import arrays_of, start_of
 from softtwin.registration.hyperparameters import DISCREPANCY, FORCE, NOISE, LogNormalPrior
 from softtwin.registration.laplace import posterior
@@ -302,6 +302,29 @@ def batch_of(body: Body, count: int = 4) -> tuple[Registrar, list[np.ndarray], l
     return registrar(body), truths, clouds
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("execution", ["graphs", "compiled"])
+def test_a_gpu_that_replays_gives_the_same(body: Body, execution: Execution) -> None:
+    made, _, clouds = batch_of(body, 1)
+    arrays = arrays_of(made.setup, made.register(clouds[0]))
+    every = [DeviceFrames(arrays, 1, 400, "cuda", execution=each) for each in ("eager", execution)]  # type: ignore[arg-type]
+    for _ in range(2):
+        one, other = (frames.register(clouds) for frames in every)
+        np.testing.assert_allclose(other.displacement, one.displacement, atol=1e-8)
+        np.testing.assert_allclose(other.margin, one.margin, atol=1e-8)
+
+
+def test_all_of_it_can_be_compiled(body: Body) -> None:
+    """As one graph without breaks, by what compilers are given; the operations stay those of torch here."""
+    made, _, clouds = batch_of(body, 1)
+    arrays = arrays_of(made.setup, made.register(clouds[0]))
+    plain, traced = (DeviceFrames(arrays, 1, 400) for _ in range(2))
+    for name in ("_iteration", "_concluded"):
+        setattr(traced, name, torch.compile(getattr(traced, name), backend="eager", fullgraph=True, dynamic=False))
+    one, other = (frames.register(clouds) for frames in (plain, traced))
+    np.testing.assert_allclose(other.displacement, one.displacement, atol=1e-10)
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_cloud_in_a_batch_is_registered_as_if_alone(body: Body, device: str) -> None:
     """Clouds of different numbers of points, from rest and then tracked."""
@@ -417,6 +440,8 @@ def test_other_arguments_are_refused(body: Body) -> None:
         DeviceFrames(arrays, 0)
     with pytest.raises(ValueError, match="confidence"):
         DeviceFrames(arrays, confidence=1.0)
+    with pytest.raises(ValueError, match="execution"):
+        DeviceFrames(arrays, execution="fast")  # type: ignore[arg-type]
     if not torch.cuda.is_available():
         with pytest.raises(ValueError, match="expected a GPU that torch can use"):
             DeviceFrames(arrays, device="cuda")
