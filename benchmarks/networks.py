@@ -2,8 +2,11 @@
 
     python benchmarks/networks.py [--tables 4.2 physics ...] [--ranks 2] [--train 8192] [--seconds 200]
     python benchmarks/networks.py --tables thesis --data FOLDER --device cuda [--epochs 100] [--channels 128]
+    python benchmarks/networks.py --tables thesis --name networks_thesis --train 20480 --law isochoric-neo-hookean
+                                  --own-alone --only "thesis: mlp, 100 epochs"
 
-The second asks for torch alone, and takes any data set (`networks_bodies.py` makes those of other bodies).
+The second asks for torch alone, and takes any data set (`networks_bodies.py` makes those of other bodies). The third is
+the thesis's own size and law on the processor: an hour and a half of one core.
 
 Makes the data of the beam of 304 hexahedra under benchmarks/runs/ where they are not there (under mpirun; goes on where
 it was stopped). Each row is one training, judged on held-out samples of its own and of the other distribution, and is
@@ -56,11 +59,14 @@ POD_MODES = 64
 AMPLITUDES = {"modal": 0.03, "random": 0.13}
 CHANNELS, FEW = 16, 2048  # of U-Mesh, and its samples, on two cores; the thesis has 128 and 20,480
 EPOCHS = 100  # of the thesis
+LAW, THESIS_LAW = "neo-hookean", "isochoric-neo-hookean"
 
 
-def data_of(kind: str, counts: dict[str, int], ranks: int, seed: int = 0, jacobians: bool = False) -> DataSet:
+def data_of(
+    kind: str, counts: dict[str, int], ranks: int, seed: int = 0, jacobians: bool = False, law: str = LAW
+) -> DataSet:
     """The beam under modal or random loads, with Jacobians in a folder of its own; what is there is not made again."""
-    plain = RUNS / f"beam-{kind}-{counts['train']}{f'-seed-{seed}' if seed else ''}"
+    plain = RUNS / f"beam-{kind}-{counts['train']}{f'-seed-{seed}' if seed else ''}{'' if law == LAW else f'-{law}'}"
     folder = plain.with_name(f"{plain.name}-jacobians") if jacobians else plain
     loads = {"kind": kind, "amplitude": AMPLITUDES[kind], "patches": 1, "radius": (0.055, 0.64)}
     samples = {**counts, "block": 16, "ranks": ranks, "seed": seed, "jacobians": jacobians}
@@ -69,7 +75,7 @@ def data_of(kind: str, counts: dict[str, int], ranks: int, seed: int = 0, jacobi
         return made
     if jacobians and made is None and (plain / "data.zarr").exists():
         shutil.copytree(plain, folder)
-    return beam_data(folder, {"loads": loads, "samples": samples}, ranks)
+    return beam_data(folder, {"loads": loads, "samples": samples, "material": {"law": law}}, ranks)
 
 
 @dataclass(frozen=True)
@@ -259,10 +265,11 @@ def sets_of(given: Given) -> dict[str, DataSet]:
     held_out = {"validation": 256, "test": 512}
     if given.data:
         return {"modal": DataSet(given.data)}
-    found = {"modal": data_of("modal", {"train": given.train, **held_out}, given.ranks, given.data_seed)}
+    how = {"ranks": given.ranks, "seed": given.data_seed, "law": given.law}
+    found = {"modal": data_of("modal", {"train": given.train, **held_out}, **how)}
     if not given.own_alone:
         count = given.train if "4.1" in given.tables else 16
-        found["random"] = data_of("random", {"train": count, **held_out}, given.ranks, given.data_seed)
+        found["random"] = data_of("random", {"train": count, **held_out}, **how)
     return found
 
 
@@ -331,6 +338,9 @@ BENCHMARK = Benchmark(
         "train": Setting(8192, "samples to learn from"),
         "seconds": Setting(200.0, "of training"),
         "data_seed": Setting(0, "other data, that nothing was chosen on"),
+        "law": Setting(
+            LAW, "of the tissue; the thesis has isochoric-neo-hookean (its eq. 2.27)", choices=(LAW, THESIS_LAW)
+        ),
         "own_alone": Setting(False, "leave the other distribution out"),
         "data": Setting(None, "data that are there, where FEniCSx is not; `modal` in the record", Path, picks=True),
         "device": Setting("auto", "of the table thesis", choices=("auto", "cpu", "cuda")),
