@@ -16,6 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from softtwin.surrogate.precision import without_tf32
@@ -28,6 +29,7 @@ from .operations import Operations, Search, blank, copied, mapped
 
 Floats = NDArray[np.float64]
 Execution = Literal["compiled", "graphs", "eager"]
+_LIMIT_OF_SIZE = 0.5  # as `meshes.clouds` has it
 _WARM_UP = 2  # runs before a capture, as CUDA asks for
 
 
@@ -113,6 +115,7 @@ class DeviceFrames:
         is_fused = device == "cuda" and execution == "compiled"
         self._operations = Operations(arrays, device, is_fused)
         self._conclusion = Conclusion(self._operations, confidence)
+        self._at_rest_tree = cKDTree(arrays.rest)
         self._clouds = torch.zeros(batch, points, 3, dtype=torch.float64, device=device)
         self._is_point = torch.zeros(batch, points, dtype=torch.bool, device=device)
         self._moved = torch.ones(batch, dtype=torch.float64, device=device)
@@ -132,8 +135,8 @@ class DeviceFrames:
             start: where each begins, of the frames before (`Frames.start`) or of `start_of`; at rest if not given.
 
         Raises:
-            ValueError: another number of clouds; one that has another shape, too few or too many points, or NaN; a
-                start of other unknowns or of another number of clouds.
+            ValueError: another number of clouds; one that has another shape, too few or too many points, or NaN, or
+                lies too far from the body; a start of other unknowns or of another number of clouds.
         """
         points, is_point = self._checked(clouds)
         begin = self._at_rest() if start is None else self._checked_start(start)
@@ -236,8 +239,25 @@ class DeviceFrames:
                 )
             if not np.isfinite(given).all():
                 raise ValueError(f"DeviceFrames.clouds[{place}]: expected finite numbers, got NaN or infinity.")
+            self._check_place(f"DeviceFrames.clouds[{place}]", given)
             points[place, : len(given)], is_point[place, : len(given)] = given, True
         return torch.from_numpy(points), torch.from_numpy(is_point)
+
+    def _check_place(self, name: str, cloud: Floats) -> None:
+        """Refuse what no search could make a state of: see `meshes.clouds.check_cloud`, which VTK is needed for."""
+        if len(np.unique(cloud[:, 0])) < POLICY.minimum_points:
+            count = len(np.unique(cloud, axis=0))
+            if count < POLICY.minimum_points:
+                raise ValueError(f"{name}: expected {POLICY.minimum_points:.0f} points at least, got {count} places.")
+        few = cloud[:: max(1, len(cloud) // ACCURACY.glance)]
+        few = (few - self.arrays.pose_translation) @ self.arrays.pose_rotation
+        far, limit = float(np.median(self._at_rest_tree.query(few)[0])), _LIMIT_OF_SIZE * float(self.arrays.size)
+        if far > limit:
+            extent = float(np.linalg.norm(np.ptp(cloud, axis=0)))
+            raise ValueError(
+                f"{name}: expected points within {limit:.3g} m of the body at rest, half of them lie {far:.3g} m off "
+                f"or more; the cloud is {extent:.3g} m across: is it in metres, and in the coordinates that were said?"
+            )
 
     def _told(self, found: Concluded, iterations: int) -> Frames:
         told = {name: _host(value) for name, value in found._asdict().items()}

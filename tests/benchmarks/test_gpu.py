@@ -13,6 +13,7 @@ pytest.importorskip("petsc4py", reason="FEniCSx is absent")
 pytest.importorskip("torch", reason="torch is absent")
 
 import numpy as np
+from kept_out import refusing
 from safetensors.numpy import save_file
 
 from softtwin.meshes.shapes import beam
@@ -29,15 +30,9 @@ from softtwin.surrogate.train import train
 pytestmark = pytest.mark.fenicsx
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "gpu.py"
 MISSING = ("vtkmodules", "zarr", "meshio", "pydantic", "pyvista", "dolfinx", "petsc4py", "mpi4py", "gmsh")
-PROGRAM = f"""
-import runpy, sys
+PROGRAM = f"""{refusing(MISSING)}
+import runpy
 
-class Refuse:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {MISSING!r}:
-            raise ModuleNotFoundError(f"kept out: {{name}}", name=name)
-
-sys.meta_path.insert(0, Refuse())
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """

@@ -12,13 +12,15 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is absent")
 
+from kept_out import refusing
+
 from softtwin.meshes.body import Body
 from softtwin.meshes.triangle_tree import TriangleTree, signed_distances
 from softtwin.registration import evidence as one_by_one
 from softtwin.registration.device.arrays import DeviceArrays, Start
 from softtwin.registration.device.closest import ClosestPoints
 from softtwin.registration.device.evidence import Hyperpriors, Sums, eigen, law_of, scale_covariance, scored, slope_of
-from softtwin.registration.device.frames import DeviceFrames, Execution, Frames
+from softtwin.registration.device.frames import DeviceFrames, Execution
 from softtwin.registration.device.from_registration import arrays_of, start_of
 from softtwin.registration.hyperparameters import DISCREPANCY, FORCE, NOISE, LogNormalPrior
 from softtwin.registration.laplace import posterior
@@ -381,15 +383,7 @@ def test_a_machine_with_torch_alone_registers(body: Body, tmp_path: Path) -> Non
     made, _, clouds = batch_of(body, 1)
     arrays_of(made.setup, made.register(clouds[0])).save(tmp_path / "arrays.safetensors")
     np.save(tmp_path / "cloud.npy", clouds[0])
-    program = f"""
-import sys
-
-class Refuse:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {KEPT_OUT!r}:
-            raise ModuleNotFoundError(f"kept out: {{name}}", name=name)
-
-sys.meta_path.insert(0, Refuse())
+    program = f"""{refusing(KEPT_OUT)}
 import numpy as np
 from softtwin.registration.device.arrays import DeviceArrays
 from softtwin.registration.device.frames import DeviceFrames
@@ -465,9 +459,14 @@ def test_other_files_are_refused(body: Body, tmp_path: Path, kind: str) -> None:
         DeviceArrays.load(path)
 
 
-def test_a_cloud_of_nowhere_has_not_converged(body: Body) -> None:
-    """What no state explains is not called one."""
+def test_a_cloud_that_is_nowhere_near_is_refused(body: Body) -> None:
+    """Millimetres, another place, one point again and again: no search is begun that could call itself converged."""
     made, _, clouds = batch_of(body, 1)
-    arrays = arrays_of(made.setup, made.register(clouds[0]))
-    found: Frames = DeviceFrames(arrays, 1, 400).register([clouds[0] + np.array([0.0, 0.0, 50.0])])
-    assert not found.has_converged[0] or found.rms_distance[0] > 1.0
+    frames = DeviceFrames(arrays_of(made.setup, made.register(clouds[0])), 1, 400)
+    start = frames.register(clouds).start
+    for begin in (None, start):
+        for wrong in (1000.0 * clouds[0], clouds[0] + np.array([0.0, 0.0, 50.0])):
+            with pytest.raises(ValueError, match="is it in metres"):
+                frames.register([wrong], begin)
+        with pytest.raises(ValueError, match="got 1 places"):
+            frames.register([np.repeat(clouds[0][:1], 100, axis=0)], begin)

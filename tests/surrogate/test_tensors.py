@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+from kept_out import refusing
 
 from softtwin.app.cli import softtwin
 from softtwin.reference.data.dataset import DataSet, DataSetError
@@ -62,15 +63,7 @@ def test_training_on_the_file_is_training_on_the_set(data: DataSet, tmp_path: Pa
 def test_a_machine_without_zarr_and_vtk_trains_and_predicts(data: DataSet, tmp_path: Path) -> None:
     """In a process that refuses to import them; the contract of the path that runs on a GPU machine."""
     path = export_tensors(data, tmp_path / "set.safetensors")
-    program = f"""
-import sys
-
-class Refuse:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {KEPT_OUT!r}:
-            raise ModuleNotFoundError(f"kept out: {{name}}", name=name)
-
-sys.meta_path.insert(0, Refuse())
+    program = f"""{refusing(KEPT_OUT)}
 import numpy as np
 from softtwin.reference.data.dataset import DataSet
 from softtwin.surrogate.evaluate import evaluate
