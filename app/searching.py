@@ -1,6 +1,6 @@
-"""Searches from rest in a process of their own: frames that are tracked meanwhile keep their pace.
+"""Searches from rest in a process of their own, beside the frames that are tracked meanwhile.
 
-In a thread a search takes half of the interpreter from the frames. The other process holds the same twin; what it finds
+In a thread a search shares the interpreter with the frames. The other process holds the same twin; what it finds
 is gone on from here, so that nothing depends on where it was found.
 """
 
