@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import chdtri, ndtr
 
-from softtwin.meshes.metrics import displacement_gradients
-
 from .expectations import Expectations
 from .forward import State
 from .gauss_newton import SolverResult
 from .hyperparameters import LogNormalPrior
+from .linear_law import turn_or_stretch
 from .loss import REJECTED
 from .outcome import Outcome
 from .parameters.block import BlockPosterior
@@ -34,7 +33,6 @@ from .verdict import Check, Code, Judgement, Verdict, checked
 
 Floats = NDArray[np.float64]
 _ABOUT = 8  # neighbours of a point, whose plane tells a surface
-_NEARLY_ALL = 95.0  # per cent of the cells
 
 
 def judge(problem: Problem, found: SolverResult, state: State, expected: Expectations) -> Judgement:
@@ -175,8 +173,7 @@ def _state(problem: Problem, state: State, expected: Expectations) -> Iterator[C
         )
         yield checked(Code.MOVEMENT, movement, expected.movement, far, refused=expected.movement, unit="m")
     if expected.gradient < np.inf:
-        gradients = displacement_gradients(problem.observed.body, state.displacement)
-        largest = float(np.percentile(np.linalg.norm(gradients, ord=2, axis=(1, 2)), _NEARLY_ALL))
+        largest = turn_or_stretch(problem.observed.body, state.displacement)
         bent = (
             f"parts of the organ turn or stretch by {100 * largest:.0f} %; its law is linear, which holds up to "
             f"{100 * expected.gradient:.0f} %"

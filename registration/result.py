@@ -12,6 +12,7 @@ from scipy.special import chdtrc
 from .evaluation import Evaluation
 from .forward import State
 from .gauss_newton import IterationRecord, SolverResult
+from .linear_law import linear_law_error
 from .local_model import LocalModel
 from .outcome import Outcome
 from .parameters.block import Estimate
@@ -288,11 +289,10 @@ class Registration:
         """How far each point may be from where it is told, `x + displacement`; computed when it is first asked for.
 
         It holds for what the problem reckons with: noise, forces like those expected, the model's error where its
-        patterns are known. Wrong stiffness, attachment or shape of the body are not among them.
+        patterns are known, what a linear law leaves out. Wrong stiffness, attachment or shape of the body are not among
+        them.
         """
-        if self.frame == "camera":
-            return self.camera_uncertainty.turned(self.pose.rotation.T)
-        return uncertainty(self.problem, self.evaluation, self.posterior, self.prepared.unseen)
+        return self.camera_uncertainty.turned(self.pose.rotation.T) if self.frame == "camera" else self._known("body")
 
     @cached_property
     def camera_uncertainty(self) -> Uncertainty:
@@ -303,7 +303,12 @@ class Registration:
         """
         if self.problem.pose is None:  # the cloud was brought to the body by a pose that is exact
             return self.uncertainty.turned(self.pose.rotation)
-        return uncertainty(self.problem, self.evaluation, self.posterior, self.prepared.unseen, "camera")
+        return self._known("camera")
+
+    def _known(self, frame: CoordinateFrame) -> Uncertainty:
+        is_linear = getattr(self.prepared.whole, "is_linear", False)
+        law_error = linear_law_error(self.problem.observed.body, self.state.displacement) if is_linear else 0.0
+        return uncertainty(self.problem, self.evaluation, self.posterior, self.prepared.unseen, frame, law_error)
 
 
 def badness(result: Registration) -> tuple[int, float]:

@@ -146,6 +146,7 @@ def uncertainty(
     posterior: Posterior,
     unseen: Floats,
     frame: CoordinateFrame = "body",
+    law_error: float = 0.0,
 ) -> Uncertainty:
     """What is known of where the nodes are, where a solver ended, in one coordinate frame.
 
@@ -160,10 +161,12 @@ def uncertainty(
         unseen: response to the directions of force that were left out, as from `unseen_response`.
         frame: of the positions: `body`, in which what holds the organ lies still, or `camera`, that of the cloud. They
             are one where no pose is unknown.
+        law_error: standard deviation of a component of each node by what the material's law leaves out, metres.
     """
-    rest = np.zeros(len(problem.observed.body.points))
+    rest = np.full(len(problem.observed.body.points), law_error)
     if problem.error is not None:
-        rest = posterior.scales.margin_discrepancy * problem.error.amplitude * problem.error.discrepancy.rest
+        left_out = problem.error.amplitude * problem.error.discrepancy.rest
+        rest = np.hypot(rest, posterior.scales.margin_discrepancy * left_out)
     if not np.isfinite(posterior.covariance).all():  # of a cloud that tells nothing that could be believed
         return Uncertainty(np.zeros((3 * len(rest), 1)), np.full(len(rest), np.inf))
     slopes, moving = _by_unknowns(problem, evaluation), np.ones(problem.size, dtype=bool)

@@ -28,6 +28,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _SMALLEST_VARIANCE = 1e-5  # of a pattern of forces, relative to the largest: rougher ones are left out
 _UNIFORM = 100.0  # of its changes, that a pressure may be all over: so much that nothing is believed of it
+_FACING = 40.0  # of its changes, that it may differ by where the surface faces: hardly anything is believed of it
 _TANGENTIAL = 0.5  # weight of movements along the observed side: they become normal where it turns
 FORCE = LogNormalPrior(0.01, 2.0, minimum=1e-5)
 
@@ -170,7 +171,9 @@ def normal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, s
     """Forces along the normal of the surface at rest alone: an unknown pressure, under which neighbours slide.
 
     So what surrounds an organ acts that is not grown together with it, as ribs and diaphragm on a lung. The pressure is
-    a part that is the same all over, of which nothing is believed, and smooth changes.
+    a part that is the same all over, one that depends on where the surface faces, n' S n for a unit normal n and a
+    symmetric S without trace, and smooth changes. Of the first two hardly anything is believed: they press and stretch
+    the organ as a whole, and go on where no point is seen, as changes, which are local, do not.
 
     Args:
         body: the body.
@@ -186,9 +189,21 @@ def normal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, s
     normals = surface.along_normals(np.ones(len(surface.rest.points)))[chosen]
     normals /= np.linalg.norm(normals, axis=1).mean()
     pressures = _correlation_root(body.points[chosen], smoothness)
-    pressures = np.hstack([np.full((len(chosen), 1), _UNIFORM), pressures])
+    pressures = np.hstack([np.full((len(chosen), 1), _UNIFORM), _FACING * _by_facing(normals), pressures])
     patterns = normals[:, :, None] * pressures[:, None, :]
     return NodalForces(chosen, patterns.reshape(3 * len(chosen), -1), len(body.points), scale)
+
+
+def _by_facing(normals: Floats) -> Floats:
+    """Pressures n' S n at unit normals n, (a, 5), for five independent S: together of unit variance for each n.
+
+    Args:
+        normals: of any length, (a, 3).
+    """
+    x, y, z = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).T
+    across = np.sqrt(3.0) * np.column_stack([x * y, x * z, y * z])
+    found: Floats = np.column_stack([across, np.sqrt(0.75) * (x * x - y * y), 1.5 * z * z - 0.5])
+    return found
 
 
 def _free_boundary(name: str, body: Body, nodes: ArrayLike, smoothness: float) -> Ints:
