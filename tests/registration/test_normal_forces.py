@@ -11,6 +11,7 @@ from softtwin.meshes.metrics import nodal_volumes
 from softtwin.meshes.shapes import beam
 from softtwin.reference.data.materials import LinearElastic
 from softtwin.registration.options import expected_force, options_for
+from softtwin.registration.parameters import nodal_forces as nodal_forces_module
 from softtwin.registration.parameters.inputs import InputBlocks
 from softtwin.registration.parameters.nodal_forces import nodal_forces, normal_forces
 from softtwin.registration.parameters.weight import Weight
@@ -57,6 +58,33 @@ def test_each_nodes_force_is_along_its_normal(block: Body) -> None:
     sizes = np.linalg.norm(patterns[:, :, 0], axis=1) / np.linalg.norm(normals, axis=1)
     np.testing.assert_allclose(sizes, sizes[0], rtol=1e-12)  # the first is one pressure all over
     assert not np.intersect1d(forces.nodes, block.fixed).size
+
+
+def test_what_differs_by_where_the_surface_faces_goes_on_unseen(
+    block: Body, model: EquilibriaModel, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pressed more along one axis than along the others, seen from one side: the far side is found by that alone."""
+    areas = area_vectors(block)
+    facing = np.square(areas[:, 1]) / np.maximum(np.square(areas).sum(axis=1), 1e-300)
+    is_free = ~np.isin(np.arange(len(block.points)), block.fixed)
+    truth = model.solve(-((300.0 + 900.0 * facing) * is_free)[:, None] * areas).displacement
+    cloud = whole_cloud(block, truth, rng, 2000)
+    cloud = cloud[cloud[:, 1] > 0.1]
+    hidden = block.points[:, 1] < 0.06
+    errors = {}
+    for part in (nodal_forces_module._FACING, 1e-3):
+        monkeypatch.setattr(nodal_forces_module, "_FACING", part)
+        registrar = prepare(
+            model,
+            block.boundary_nodes,
+            force_scale=expected_force(block, MODULUS),
+            smoothness=0.05,
+            options=options_for(model, True),
+            along_normals=True,
+        )
+        errors[part] = np.linalg.norm(registrar.register(cloud).displacement - truth, axis=1)[hidden].mean()
+    known, unknown = errors.values()
+    assert known < 0.5 * unknown and known < 0.15 * np.linalg.norm(truth[hidden], axis=1).mean()
 
 
 @pytest.mark.parametrize("made", [normal_forces, nodal_forces])
