@@ -32,7 +32,7 @@ Variances = Callable[[Floats], tuple[Floats, Floats]]
 _STEPS, _TRIALS = 20, 10  # of a descent, and lengths of each
 _FLAT = 0.1  # slope a standard deviation of a logarithm, below which a descent ends
 _GAIN = 1e-7  # of the cost: so little gained ends it, too
-_LONGEST = 3.0  # standard deviations that a step may take
+_LONGEST = 1.0  # of a logarithm that a step may take: a factor of e
 _ENOUGH = 1e-4  # of what the slope promises has a step to gain (Armijo)
 _BEHIND = 30.0  # of the logarithm of the evidence: no descent begins so far behind the best so far
 _STEP = 1e-5  # of a logarithm, for a difference
@@ -316,7 +316,7 @@ class Evidence:
                 return value, gradient[sought] * unit
 
             low, high = ((bounds - place[:, None]) / unit[:, None]).T
-            least, found = _descended(cost, (first, slope[sought] * unit), low, high)
+            least, found = _descended(cost, (first, slope[sought] * unit), low, high, _LONGEST / unit)
             if np.isfinite(least) and least < lowest:
                 lowest, best = least, start.copy()
                 best[sought] += unit * found
@@ -394,7 +394,9 @@ def _doubled(count: int) -> Floats:
     return 2.0 * np.triu(np.ones((count, count))) - np.eye(count)
 
 
-def _descended(cost: Callable[[Floats], Known], first: Known, low: Floats, high: Floats) -> tuple[float, Floats]:
+def _descended(
+    cost: Callable[[Floats], Known], first: Known, low: Floats, high: Floats, longest: Floats
+) -> tuple[float, Floats]:
     """The least of a smooth cost within bounds, and where, (q,), by projected BFGS from zero.
 
     For the handful of unknowns here, a step in which takes less than a library spends on calling itself.
@@ -404,6 +406,7 @@ def _descended(cost: Callable[[Floats], Known], first: Known, low: Floats, high:
         first: the same at zero.
         low: least values, (q,).
         high: largest values, (q,).
+        longest: steps, (q,).
     """
     place, (value, slope), inverse = np.zeros(len(low)), first, np.eye(len(low))
     for _ in range(_STEPS):
@@ -414,7 +417,7 @@ def _descended(cost: Callable[[Floats], Known], first: Known, low: Floats, high:
         step = np.where(held, 0.0, -inverse @ free)
         if not step @ free < 0.0:
             step, inverse = -free, np.eye(len(low))
-        step *= min(1.0, _LONGEST / np.abs(step).max())
+        step *= min(1.0, 1.0 / (np.abs(step) / longest).max())
         for _ in range(_TRIALS):
             trial = np.clip(place + step, low, high)
             reached, there = cost(trial)

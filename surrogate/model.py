@@ -481,6 +481,7 @@ class ReducedSurrogate:
         )  # by the coefficients and by what the network says
         self.offset_rows = encoder_decoder.offset[picked]
         self._some: tuple[int, Floats] | None = None
+        self._is_asked = False
 
     @property
     def count(self) -> int:
@@ -498,7 +499,7 @@ class ReducedSurrogate:
         """The same for the basis times a matrix, (k, j), for the price of some small products."""
         other = copy.copy(self)
         other.__dict__.pop("_linear", None)
-        other._some = None
+        other._some, other._is_asked = None, False
         other.encode, other._combination = self.encode @ matrix, self._combination @ matrix
         other._linear_rows = self._linear_rows @ matrix
         other.rows = np.hstack([other._linear_rows, self._decode_rows])
@@ -509,8 +510,14 @@ class ReducedSurrogate:
         return self.surrogate.encoder_decoder.linear(self._basis @ self._combination)
 
     def linear(self, coefficients: Floats) -> Floats:
-        """Linear part of the displacement of all nodes, (3n,), metres."""
-        return self._linear @ coefficients
+        """Linear part of the displacement of all nodes, (3n,), metres.
+
+        The first time without the matrix between them: a search from rest asks once, the frames that follow again.
+        """
+        if self._is_asked:
+            return self._linear @ coefficients
+        self._is_asked = True
+        return self.surrogate.encoder_decoder.linear(self._basis @ (self._combination @ coefficients))
 
     def solve(self, coefficients: ArrayLike, near: Any = None) -> ReducedSurrogateState:
         """The state for force coefficients, (k,): `near` itself where it is that.

@@ -369,12 +369,12 @@ class AverageAtPoint:
         """Changes of the values, (r, k), for changes of the coordinates, (r, k)."""
         net, (gate, slopes) = self._net, self._slopes
         dx = (tangents.numpy().T @ net.turns.transpose(0, 2, 1)) * net.input_scale  # (g, k, r)
-        hidden = dx @ net.enter[0]
+        hidden = _times(dx, net.enter[0])
         for slope, (inner, outer) in zip(slopes, net.pairs, strict=True):
-            bent = hidden @ inner[0]
+            bent = _times(hidden, inner[0])
             bent *= slope[:, None]
-            hidden += bent @ outer[0]
-        change = hidden @ net.leave[0]
+            hidden += _times(bent, outer[0])
+        change = _times(hidden, net.leave[0])
         change *= self._gate[:, None]
         change += (dx @ gate[:, :, None]) * self._missing[:, None]
         change *= net.output_scale
@@ -389,6 +389,12 @@ class AverageAtPoint:
             hidden = hidden + (slope * (hidden @ outer[0].T)) @ inner[0].T
         dx = hidden @ net.enter[0].T + gate * (self._missing * change).sum(axis=1, keepdims=True)
         return torch.from_numpy(((dx * net.input_scale)[:, None] @ net.turns).sum(axis=0)[0])
+
+
+def _times(rows: Array, matrix: Array) -> Array:
+    """A product of some dozen rows by torch, whose kernels are made for networks."""
+    found: Array = torch.matmul(torch.from_numpy(rows), torch.from_numpy(matrix)).numpy()
+    return found
 
 
 def _layer(layer: nn.Linear) -> Layer:

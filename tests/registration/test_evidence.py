@@ -98,6 +98,16 @@ def test_its_curvature_is_exact(rng: np.random.Generator, has_known: bool) -> No
     np.testing.assert_allclose(evidence.curvature(eta, np.arange(3)), np.array(slopes) / 2e-5, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.parametrize("factor", [0.1, 10.0, 100.0])
+def test_one_search_reaches_a_noise_that_is_far_off(rng: np.random.Generator, factor: float) -> None:
+    """Many points tell their noise to a few per cent: in steps of so little it would take hundreds of them."""
+    truth = np.log([0.3, 2.0, 0.5])
+    evidence = Drawn(rng, truth).evidence
+    near, far = evidence.maximum([truth]), evidence.maximum([truth + [np.log(factor), 0.0, 0.0]])
+    deviations = np.sqrt(np.diag(evidence.covariance(near)))
+    assert np.abs((far - near) / deviations).max() < 0.2
+
+
 def test_scales_that_data_were_drawn_with_are_found_within_their_doubt() -> None:
     truth, off = np.log([0.3, 2.0, 0.5]), []
     for seed in range(60):
@@ -201,7 +211,7 @@ def test_the_descent_ends_where_a_librarys_does(number: int) -> None:
         return float(value), bend @ off + 0.3 * np.sinh(0.3 * off)
 
     low, high = -rng.uniform(0.0, 4.0, size), rng.uniform(0.0, 4.0, size)
-    value, place = _descended(cost, cost(np.zeros(size)), low, high)
+    value, place = _descended(cost, cost(np.zeros(size)), low, high, np.full(size, 3.0))
     bounds = list(zip(low, high, strict=True))
     wanted = minimize(cost, np.zeros(size), jac=True, method="L-BFGS-B", bounds=bounds, options={"gtol": 1e-9})
     assert (place >= low).all() and (place <= high).all() and value == cost(place)[0]
@@ -213,7 +223,7 @@ def test_a_descent_steps_back_from_where_there_is_no_cost() -> None:
         x = float(place[0])
         return (np.inf, np.zeros(1)) if x >= 1.0 else (float(-np.log(1.0 - x) - 3.0 * x), np.array([1 / (1 - x) - 3]))
 
-    value, place = _descended(cost, cost(np.zeros(1)), np.array([-9.0]), np.array([9.0]))
+    value, place = _descended(cost, cost(np.zeros(1)), np.array([-9.0]), np.array([9.0]), np.array([3.0]))
     assert place[0] == pytest.approx(2.0 / 3.0, abs=0.02) and np.isfinite(value)
 
 
