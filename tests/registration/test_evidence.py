@@ -103,7 +103,7 @@ def test_one_search_reaches_a_noise_that_is_far_off(rng: np.random.Generator, fa
     """Many points tell their noise to a few per cent: in steps of so little it would take hundreds of them."""
     truth = np.log([0.3, 2.0, 0.5])
     evidence = Drawn(rng, truth).evidence
-    near, far = evidence.maximum([truth]), evidence.maximum([truth + [np.log(factor), 0.0, 0.0]])
+    near, far = evidence.maximum([truth]), evidence.maximum([truth + np.array([np.log(factor), 0.0, 0.0])])
     deviations = np.sqrt(np.diag(evidence.covariance(near)))
     assert np.abs((far - near) / deviations).max() < 0.2
 
