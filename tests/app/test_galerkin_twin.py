@@ -26,7 +26,6 @@ from softtwin.reference.solve.problem import Problem
 from softtwin.registration.verdict import Verdict
 
 pytestmark = pytest.mark.fenicsx
-FEW = "{ modes = 12, curved = 8, derivatives = 16, own = 8, cells = 160 }"  # what the default takes a minute for
 VARY = '{ poisson-ratio = [0.38, 0.48], "young-modulus@tumour" = [5000.0, 40000.0] }'
 
 
@@ -38,8 +37,6 @@ def folder(small_quickstart: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     text = (place / "organ.toml").read_text()
     text = re.sub(r'^architecture = "reduced"', 'architecture = "galerkin"', text, flags=re.M)
     text = re.sub(r"^vary = \{\}", f"vary = {VARY}", text, flags=re.M)
-    text = re.sub(r"^settings = \{\}", f"settings = {FEW}", text, flags=re.M)
-    assert VARY in text and FEW in text
     (place / "organ.toml").write_text(text)
     for words in (["train", str(place / "organ.toml"), "--fresh"], ["validate", str(place / "organ.toml")]):
         done = CliRunner().invoke(softtwin, words)
