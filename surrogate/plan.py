@@ -6,6 +6,8 @@ import math
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, get_args
 
+import torch
+
 from .architecture import Architecture, TrainedArchitecture
 from .physics import Physics
 from .reduced import Reduced
@@ -95,3 +97,23 @@ class TrainingPlan:
 
 def _settings(plan: Any, *apart: str) -> dict[str, Any]:
     return {one.name: getattr(plan, one.name) for one in fields(plan) if one.name not in apart}
+
+
+def chosen_device(plan: TrainingPlan) -> str:
+    """Where to train.
+
+    Raises:
+        ValueError: a GPU is asked for, and torch sees none, or fewer than there are processes.
+    """
+    if plan.device == "cuda" and not torch.cuda.is_available():
+        raise ValueError(
+            "TrainingPlan.device: expected a GPU that torch can use, found none (torch "
+            f"{torch.__version__}); take 'cpu' or 'auto', or a build of torch with CUDA."
+        )
+    device = "cuda" if plan.device != "cpu" and torch.cuda.is_available() else "cpu"
+    if device == "cuda" and plan.processes > torch.cuda.device_count():
+        raise ValueError(
+            f"TrainingPlan.processes: expected at most one for each of {torch.cuda.device_count()} GPUs, got "
+            f"{plan.processes}; take fewer, or the device 'cpu'."
+        )
+    return device

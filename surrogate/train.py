@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import lightning
 import numpy as np
 import torch
 
@@ -21,8 +20,7 @@ from .architecture import FittedArchitecture
 from .checkpoint import CHECKPOINT, fingerprint, read_checkpoint
 from .model import Surrogate
 from .physics import with_physics
-from .plan import TrainingPlan
-from .training_module import TrainingModule, chosen_device, fit
+from .plan import TrainingPlan, chosen_device
 
 
 def train(
@@ -54,6 +52,10 @@ def train(
     mark = fingerprint(data, splits)
     if isinstance(plan.architecture, FittedArchitecture):
         return _fitted(data, plan, splits, mark, clock)
+    import lightning  # takes seconds, which what is made at once, or only evaluated, need not wait for
+
+    from .training_module import TrainingModule, fit
+
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(folder or temporary) / CHECKPOINT
         resumed = read_checkpoint(path, plan, mark) if path.exists() else None

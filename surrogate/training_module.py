@@ -26,7 +26,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .checkpoint import VERSION
-from .plan import TrainingPlan
+from .plan import TrainingPlan, chosen_device
 from .precision import forbid_onednn, forbid_tf32, without_onednn, without_tf32
 
 ROUNDS = 40  # a round ends with a look at the validation split and a checkpoint
@@ -38,26 +38,6 @@ _ENDLESS = 10**9  # steps of a round that the clock ends
 
 class Diverged(RuntimeError):  # noqa: N818 - a way to end, as NotConverged is
     """Training whose validation error is no finite number any more: the message says what to try."""
-
-
-def chosen_device(plan: TrainingPlan) -> str:
-    """Where to train.
-
-    Raises:
-        ValueError: a GPU is asked for, and torch sees none, or fewer than there are processes.
-    """
-    if plan.device == "cuda" and not torch.cuda.is_available():
-        raise ValueError(
-            "TrainingPlan.device: expected a GPU that torch can use, found none (torch "
-            f"{torch.__version__}); take 'cpu' or 'auto', or a build of torch with CUDA."
-        )
-    device = "cuda" if plan.device != "cpu" and torch.cuda.is_available() else "cpu"
-    if device == "cuda" and plan.processes > torch.cuda.device_count():
-        raise ValueError(
-            f"TrainingPlan.processes: expected at most one for each of {torch.cuda.device_count()} GPUs, got "
-            f"{plan.processes}; take fewer, or the device 'cpu'."
-        )
-    return device
 
 
 def _count_steps(plan: TrainingPlan, sample_count: int) -> int | None:

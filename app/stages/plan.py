@@ -8,10 +8,9 @@ from typing import Any
 
 from softtwin.surrogate.galerkin import Galerkin
 from softtwin.surrogate.physics import Physics
-from softtwin.surrogate.plan import Device, TrainingPlan
+from softtwin.surrogate.plan import Device, TrainingPlan, chosen_device
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.registry import ARCHITECTURES
-from softtwin.surrogate.training_module import chosen_device
 
 from ..config import ConfigError, TrainingSection
 

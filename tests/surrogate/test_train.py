@@ -6,6 +6,8 @@ import csv
 import importlib
 import os
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,12 +25,12 @@ from softtwin.surrogate.evaluate import evaluate
 from softtwin.surrogate.mlp import Perceptron
 from softtwin.surrogate.model import Surrogate
 from softtwin.surrogate.physics import Physics
-from softtwin.surrogate.plan import TrainingPlan
+from softtwin.surrogate.plan import TrainingPlan, chosen_device
 from softtwin.surrogate.precision import without_tf32
 from softtwin.surrogate.reduced import Reduced
 from softtwin.surrogate.registry import TRAINED
 from softtwin.surrogate.train import train
-from softtwin.surrogate.training_module import Diverged, TrainingModule, chosen_device, fit, rate_factor
+from softtwin.surrogate.training_module import Diverged, TrainingModule, fit, rate_factor
 from softtwin.surrogate.transolver import Transolver
 from softtwin.surrogate.umesh import UMesh
 
@@ -483,3 +485,10 @@ def test_more_processes_than_gpus_are_refused(
 def test_wrong_settings_of_training_are_named(setting: str, value: Any) -> None:
     with pytest.raises(ValueError, match=rf"TrainingPlan\.{setting}: expected"):
         TrainingPlan(**{setting: value})
+
+
+def test_what_is_only_evaluated_waits_for_no_trainer() -> None:
+    """Lightning takes seconds to import: only what trains step by step does, in a process of its own here."""
+    script = "import sys, softtwin.surrogate.train, softtwin.surrogate.evaluate; print('lightning' in sys.modules)"
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=True)
+    assert told.stdout.split() == ["False"]
