@@ -27,8 +27,7 @@ from .block import ParameterBlock
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _SMALLEST_VARIANCE = 1e-5  # of a pattern of forces, relative to the largest: rougher ones are left out
-_UNIFORM = 100.0  # of its changes, that a pressure may be all over: so much that nothing is believed of it
-_FACING = 40.0  # of its changes, that it may differ by where the surface faces: hardly anything is believed of it
+_WHOLE = 100.0  # of its changes, that a pressure presses a body as a whole: so much that nothing is believed of it
 _TANGENTIAL = 0.5  # weight of movements along the observed side: they become normal where it turns
 FORCE = LogNormalPrior(0.01, 2.0, minimum=1e-5)
 
@@ -172,7 +171,7 @@ def normal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, s
 
     So what surrounds an organ acts that is not grown together with it, as ribs and diaphragm on a lung. The pressure is
     a part that is the same all over, one that depends on where the surface faces, n' S n for a unit normal n and a
-    symmetric S without trace, and smooth changes. Of the first two hardly anything is believed: they press and stretch
+    symmetric S without trace, and smooth changes. Of the first two nothing is believed: they press and stretch
     the organ as a whole, and go on where no point is seen, as changes, which are local, do not.
 
     Args:
@@ -189,7 +188,7 @@ def normal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, s
     normals = surface.along_normals(np.ones(len(surface.rest.points)))[chosen]
     normals /= np.linalg.norm(normals, axis=1).mean()
     pressures = _correlation_root(body.points[chosen], smoothness)
-    pressures = np.hstack([np.full((len(chosen), 1), _UNIFORM), _FACING * _by_facing(normals), pressures])
+    pressures = np.hstack([np.full((len(chosen), 1), _WHOLE), _WHOLE * _by_facing(normals), pressures])
     patterns = normals[:, :, None] * pressures[:, None, :]
     return NodalForces(chosen, patterns.reshape(3 * len(chosen), -1), len(body.points), scale)
 

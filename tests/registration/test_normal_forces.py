@@ -72,8 +72,9 @@ def test_what_differs_by_where_the_surface_faces_goes_on_unseen(
     cloud = cloud[cloud[:, 1] > 0.1]
     hidden = block.points[:, 1] < 0.06
     errors = {}
-    for part in (nodal_forces_module._FACING, 1e-3):
-        monkeypatch.setattr(nodal_forces_module, "_FACING", part)
+    by_facing = nodal_forces_module._by_facing
+    for part in (1.0, 1e-5):
+        monkeypatch.setattr(nodal_forces_module, "_by_facing", lambda normals, part=part: part * by_facing(normals))
         registrar = prepare(
             model,
             block.boundary_nodes,
