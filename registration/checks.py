@@ -22,7 +22,7 @@ from .expectations import Expectations
 from .forward import State
 from .gauss_newton import SolverResult
 from .hyperparameters import LogNormalPrior
-from .linear_law import turn_or_stretch
+from .linear_law import displacement_gradient_norm
 from .loss import REJECTED
 from .outcome import Outcome
 from .parameters.block import BlockPosterior
@@ -173,7 +173,7 @@ def _state(problem: Problem, state: State, expected: Expectations) -> Iterator[C
         )
         yield checked(Code.MOVEMENT, movement, expected.movement, far, refused=expected.movement, unit="m")
     if expected.gradient < np.inf:
-        largest = turn_or_stretch(problem.observed.body, state.displacement)
+        largest = displacement_gradient_norm(problem.observed.body, state.displacement)
         bent = (
             f"parts of the organ turn or stretch by {100 * largest:.0f} %; its law is linear, which holds up to "
             f"{100 * expected.gradient:.0f} %"

@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 _NEARLY_ALL = 95.0  # per cent of the cells
 
 
-def turn_or_stretch(body: Body, displacement: Floats) -> float:
+def displacement_gradient_norm(body: Body, displacement: Floats) -> float:
     """Norm of the displacement's gradient that nearly all cells stay below, dimensionless.
 
     Args:
@@ -35,4 +35,4 @@ def linear_law_error(body: Body, displacement: Floats) -> float:
         displacement: that a linear law has found, (n, 3), metres.
     """
     largest = float(np.linalg.norm(displacement, axis=1).max())
-    return 0.5 * turn_or_stretch(body, displacement) * largest / np.sqrt(3.0)
+    return 0.5 * displacement_gradient_norm(body, displacement) * largest / np.sqrt(3.0)
