@@ -197,9 +197,9 @@ def _by_facing(normals: Floats) -> Floats:
     """Pressures n' S n at unit normals n, (a, 5), for five independent S: together of unit variance for each n.
 
     Args:
-        normals: of any length, (a, 3).
+        normals: of any length, (a, 3); one of none carries no pressure.
     """
-    x, y, z = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).T
+    x, y, z = (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)).T
     across = np.sqrt(3.0) * np.column_stack([x * y, x * z, y * z])
     found: Floats = np.column_stack([across, np.sqrt(0.75) * (x * x - y * y), 1.5 * z * z - 0.5])
     return found

@@ -60,6 +60,15 @@ def test_each_nodes_force_is_along_its_normal(block: Body) -> None:
     assert not np.intersect1d(forces.nodes, block.fixed).size
 
 
+def test_pressures_by_facing_are_of_one_size_whatever_faces_where(rng: np.random.Generator) -> None:
+    normals = rng.standard_normal((50, 3))
+    found = nodal_forces_module._by_facing(normals)
+    np.testing.assert_allclose(np.square(found).sum(axis=1), 1.0)
+    turned = nodal_forces_module._by_facing(normals @ np.linalg.qr(rng.standard_normal((3, 3)))[0])
+    np.testing.assert_allclose(turned @ turned.T, found @ found.T, atol=1e-12)  # no axis is another than the others
+    assert np.isfinite(nodal_forces_module._by_facing(np.zeros((1, 3)))).all()  # a node on which nothing can press
+
+
 def test_what_differs_by_where_the_surface_faces_goes_on_unseen(
     block: Body, model: EquilibriaModel, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
