@@ -15,7 +15,7 @@ from softtwin.registration.parameters import nodal_forces as nodal_forces_module
 from softtwin.registration.parameters.inputs import InputBlocks
 from softtwin.registration.parameters.nodal_forces import nodal_forces, normal_forces
 from softtwin.registration.parameters.weight import Weight
-from softtwin.registration.registrar import prepare
+from softtwin.registration.registrar import Registrar, prepare
 from softtwin.surrogate.equilibria import Equilibria
 from softtwin.surrogate.equilibria_model import EquilibriaModel
 
@@ -47,6 +47,18 @@ def whole_cloud(body: Body, displacement: Floats, rng: np.random.Generator, coun
     chosen = body.boundary[rng.integers(len(body.boundary), size=count)]
     points = np.einsum("pk,pki->pi", rng.dirichlet(np.ones(3), size=count), (body.points + displacement)[chosen])
     return points + NOISE * rng.standard_normal(points.shape)
+
+
+def everywhere(model: EquilibriaModel, along: bool = True) -> Registrar:
+    """Forces all over the surface, along its normal or in any direction."""
+    return prepare(
+        model,
+        model.body.boundary_nodes,
+        force_scale=expected_force(model.body, MODULUS),
+        smoothness=0.05,
+        options=options_for(model, True),
+        along_normals=along,
+    )
 
 
 def test_each_nodes_force_is_along_its_normal(block: Body) -> None:
@@ -84,14 +96,7 @@ def test_what_differs_by_where_the_surface_faces_goes_on_unseen(
     by_facing = nodal_forces_module._by_facing
     for part in (1.0, 1e-5):
         monkeypatch.setattr(nodal_forces_module, "_by_facing", lambda normals, part=part: part * by_facing(normals))
-        registrar = prepare(
-            model,
-            block.boundary_nodes,
-            force_scale=expected_force(block, MODULUS),
-            smoothness=0.05,
-            options=options_for(model, True),
-            along_normals=True,
-        )
+        registrar = everywhere(model)
         errors[part] = np.linalg.norm(registrar.register(cloud).displacement - truth, axis=1)[hidden].mean()
     known, unknown = errors.values()
     assert known < 0.5 * unknown and known < 0.15 * np.linalg.norm(truth[hidden], axis=1).mean()
@@ -118,14 +123,7 @@ def test_a_pressure_is_found_inside_too(block: Body, model: EquilibriaModel, rng
     assert np.linalg.norm(truth, axis=1).max() > 0.02
     errors = {}
     for along in (True, False):
-        registrar = prepare(
-            model,
-            block.boundary_nodes,
-            force_scale=expected_force(block, MODULUS),
-            smoothness=0.05,
-            options=options_for(model, True),
-            along_normals=along,
-        )
+        registrar = everywhere(model, along)
         found = registrar.register(cloud)
         errors[along] = np.linalg.norm(found.displacement - truth, axis=1)
         if along:
