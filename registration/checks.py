@@ -178,7 +178,8 @@ def _state(problem: Problem, state: State, expected: Expectations) -> Iterator[C
             f"parts of the organ turn or stretch by {100 * largest:.0f} %; its law is linear, which holds up to "
             f"{100 * expected.gradient:.0f} %"
         )
-        yield checked(Code.LINEAR_LAW, largest, expected.gradient, bent)
+        # Below a norm of 1 no cell is turned inside out; beyond, nothing says that this is a body.
+        yield checked(Code.LINEAR_LAW, largest, expected.gradient, bent, refused=1.0)
     ratio, limit = state.extrapolation_ratio, expected.extrapolation_ratio
     if ratio is not None:
         beyond = f"the load is {ratio:.1f} times the largest that the surrogate has learned"

@@ -13,7 +13,7 @@ from softtwin.registration.options import expected_force, options_for
 from softtwin.registration.registrar import prepare
 from softtwin.registration.result import Registration
 from softtwin.registration.uncertainty import uncertainty
-from softtwin.registration.verdict import Code
+from softtwin.registration.verdict import Code, Verdict
 from softtwin.surrogate.equilibria import Equilibria
 from softtwin.surrogate.equilibria_model import EquilibriaModel
 
@@ -60,6 +60,13 @@ def test_margins_hold_what_a_linear_law_leaves_out(block: Body, rng: np.random.G
     for frame in (found.uncertainty, found.camera_uncertainty):
         assert np.mean(errors < frame.margin(confidence=0.9)[is_free]) > 0.85
         np.testing.assert_allclose(frame.rest, linear_law_error(block, found.displacement))
+
+
+def test_a_body_that_may_be_inside_out_is_refused(block: Body, rng: np.random.Generator) -> None:
+    found, _ = registered(block, LinearElastic, 4.0, rng)
+    (check,) = (each for each in found.judgement.checks if each.code is Code.LINEAR_LAW)
+    assert check.statistic > 1.0 and check.verdict is Verdict.REFUSED
+    assert found.judgement.verdict is Verdict.REFUSED
 
 
 def test_a_law_that_is_not_linear_has_its_own_margins(block: Body, rng: np.random.Generator) -> None:
