@@ -27,11 +27,15 @@ class Loss(Protocol):
     def consistency(self) -> float:
         """E[w x^2] / E[w] for normal x: what a weighted mean of squares must be divided by."""
 
+    @property
+    def shrinkage(self) -> float:
+        """E[(w x)^2] / E[w] for normal x: what weights make of the variance of a sum of residuals."""
 
-def _consistency(loss: Loss) -> float:
-    density = np.exp(-0.5 * _QUADRATURE**2)
-    weight = loss.weight(_QUADRATURE) * density
-    return float((weight * _QUADRATURE**2).sum() / weight.sum())
+
+def _expected(loss: Loss, power: int) -> float:
+    """E[w^power x^2] / E[w] for normal x."""
+    density, weight = np.exp(-0.5 * _QUADRATURE**2), loss.weight(_QUADRATURE)
+    return float((weight**power * _QUADRATURE**2 * density).sum() / (weight * density).sum())
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,11 @@ class Square:
 
     @property
     def consistency(self) -> float:
+        """1."""
+        return 1.0
+
+    @property
+    def shrinkage(self) -> float:
         """1."""
         return 1.0
 
@@ -77,7 +86,12 @@ class Huber:
     @cached_property
     def consistency(self) -> float:
         """E[w x^2] / E[w]."""
-        return _consistency(self)
+        return _expected(self, 1)
+
+    @cached_property
+    def shrinkage(self) -> float:
+        """E[(w x)^2] / E[w]."""
+        return _expected(self, 2)
 
 
 @dataclass(frozen=True)
@@ -106,7 +120,12 @@ class Tukey:
     @cached_property
     def consistency(self) -> float:
         """E[w x^2] / E[w]."""
-        return _consistency(self)
+        return _expected(self, 1)
+
+    @cached_property
+    def shrinkage(self) -> float:
+        """E[(w x)^2] / E[w]."""
+        return _expected(self, 2)
 
 
 def _check(name: str, value: float) -> None:

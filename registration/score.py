@@ -76,7 +76,9 @@ def gain_by_shared_noise(local: LocalModel, problem: Problem) -> tuple[float, fl
     such noise, the evidence grows by the factor of logarithm (s' (V^-1 / t + M)^-1 s - log |1 + t M V|) / 2. That costs
     an eigendecomposition, and is looked at where the parabola about t = 0 promises something: its slope is
     U = (s' V s - tr(M V)) / 2, its bend I = tr(M V M V) / 2, its top U^2 / (2 I). Robust weights make s smaller than M
-    tells, which is made good. The other hyperparameters stay as they are. The smoothest modes are asked first.
+    tells, which is made good, as far as normal noise would need it: points nearer than their noise is believed to be,
+    as those without any are, say nothing of their neighbours by that. The other hyperparameters stay as they are. The
+    smoothest modes are asked first.
 
     Args:
         local: the objective's model at the end of a registration without shared noise.
@@ -111,7 +113,7 @@ class _SharedNoise:
         pull, self._covariance = local.score_of(shared.by_points(local.evaluation))
         weights, scaled = local.weights, local.problem.residuals(local.evaluation, local.point_noise) / local.deviations
         shrunk = float(np.sum((weights * scaled) ** 2) / max(weights.sum(), 1e-300))
-        self._pull = pull / np.sqrt(max(shrunk, 1e-300))
+        self._pull = pull / np.sqrt(max(shrunk, local.loss.shrinkage))
         median, high = float(hyperprior.median[SHARED]), float(hyperprior.highest[SHARED])
         self._sizes = np.linspace(max(float(hyperprior.lowest[SHARED]), median), high, ACCURACY.sizes)
         self._costs = 0.5 * ((self._sizes - median) / hyperprior.spread[SHARED]) ** 2

@@ -1,4 +1,8 @@
-"""From rest: the leading directions of force first, then all; each round of gathering the forces goes on from there."""
+"""From rest: the leading directions of force first, then all; each round of gathering the forces goes on from there.
+
+A model whose error is known in patterns has them among its unknowns only with all points, in `finish`: before that they
+count as noise. An exact model, each state of which is dear, goes to the end of it at once.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +37,7 @@ class Localised(Ended):
 
 
 def localise(setup: Setup, points: Cloud, leading: int | None = None) -> Localised:
-    """The place of the forces, from rest; where time is over before the end, as far as it was found.
+    """Where the forces act, from rest; where time is over before the end, as far as it was found.
 
     Args:
         setup: what is registered.
@@ -41,20 +45,38 @@ def localise(setup: Setup, points: Cloud, leading: int | None = None) -> Localis
         leading: directions of force to begin with; `ACCURACY.leading` if not given.
     """
     prepared, rule, solver = setup.unlocalised, setup.options.localisation, setup.options.solver
-    few, is_gathered = points.thinned(rule.points), rule.rounds > 0
-    begun = (few, prepared, solver) if is_gathered else (points, prepared, solver.unsettled())
-    found = from_rest(setup, *begun, leading)
+    if rule.rounds == 0:
+        return Localised(prepared, begin(setup, points, prepared, solver.unsettled(), leading), False)
+    few = points.thinned(rule.points)
+    found = _from_rest(setup, few, prepared, solver, leading)
     for left in reversed(range(rule.rounds)):
         if setup.is_hopeless(found) or setup.is_late:
             break
         nodal = prepared.forces.forces(found.evaluation.coefficients[: prepared.forces.size])
-        prepared, seen = _gathered(setup, nodal), few if left else points
+        prepared, seen = _gathered(setup, nodal), few if left or setup.error is not None else points
         try:
             again = _carried_on(setup.plain(seen, prepared), solver, found, nodal)
         except NotConverged:  # gathered, such forces may have no state
-            again = from_rest(setup, seen, prepared, solver, leading)
+            again = _from_rest(setup, seen, prepared, solver, leading)
         found = after(found, again)
-    return Localised(prepared, found, is_gathered)
+    return Localised(prepared, found)
+
+
+def begin(
+    setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS, leading: int | None = None
+) -> SolverResult:
+    """What `finish` goes on from, where forces are not gathered: from rest.
+
+    Args:
+        setup: what is registered.
+        points: of the cloud.
+        prepared: forces.
+        solver: that ends it, where the model's error is not known in patterns.
+        leading: as for `localise`.
+    """
+    if setup.error is None:
+        return _from_rest(setup, points, prepared, solver, leading)
+    return _led(setup, points, prepared, leading)
 
 
 def _carried_on(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResult, nodal: Floats) -> SolverResult:
@@ -64,30 +86,28 @@ def _carried_on(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResu
     return solver.solve(problem, start, found.evaluation, found.local.eta)
 
 
-def from_rest(
-    setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS, leading: int | None = None
-) -> SolverResult:
-    """First the leading directions alone, which cannot fold the surface into a wrong minimum, then all.
-
-    Args:
-        setup: what is registered.
-        points: of the cloud.
-        prepared: forces.
-        solver: that ends it.
-        leading: as for `localise`.
-    """
+def _led(setup: Setup, points: Cloud, prepared: Prepared, leading: int | None) -> SolverResult:
+    """From rest, with the leading directions of force alone, which cannot fold the surface into a wrong minimum."""
     few, first = points.thinned(setup.options.localisation.points), prepared.leading(leading or ACCURACY.leading)
-    coarse, problem = setup.plain(few, first).unshared, setup.plain(points, prepared)
-    begun = solver.coarse().solve(coarse, np.zeros(coarse.size))
-    start = problem.carried(begun.evaluation.coefficients, coarse)
-    start[: first.forces.size] = begun.evaluation.coefficients[coarse.force_part]
+    coarse = setup.plain(few, first).unshared
+    return setup.options.solver.coarse().solve(coarse, np.zeros(coarse.size))
+
+
+def _from_rest(
+    setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS, leading: int | None
+) -> SolverResult:
+    """First the leading directions alone, then all, the model's error taken for noise."""
+    begun, problem = _led(setup, points, prepared, leading), setup.plain(points, prepared)
     if setup.is_hopeless(begun):  # what six directions leave as far off is no state of this organ
         solver = solver.without_steps()
-    return after(begun, solver.solve(problem, start, begun.evaluation, begun.local.eta))
+    return _from(problem, solver, begun)
 
 
 def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
     """With all points, and with the model's error in patterns, from a result that took it for noise.
+
+    The forces' size and noise that neighbours share are asked for where the search has nearly ended: before that all
+    are off alike.
 
     Args:
         setup: what is registered.
@@ -99,17 +119,26 @@ def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
         solver = solver.without_steps()
     believed = prepared if setup.error is not None else _believed(setup, prepared, found)
     problem = setup.problem(points, believed, found.evaluation.positions, found.rms_distance)
+    if setup.error is not None:
+        found = _from(problem.unshared, solver.unsettled(), found)
+        believed = _believed(setup, believed, found)
+        problem = problem.with_forces(believed.forces)
     is_settled = begun.is_settled and believed is prepared and len(found.evaluation.cloud) == len(points)
     if setup.error is not None or not is_settled:
-        found = _from(problem, solver, found, problem.carried(found.evaluation.coefficients, found.local.problem))
+        found = _from(problem, solver, found)
     wider = _believed(setup, believed, found)
-    if wider is not believed:  # seen only now that the model's error is told from noise
+    if wider is not believed:  # seen only now that noise which neighbours share is told from each point's own
         believed, problem = wider, problem.with_forces(wider.forces)
-        found = _from(problem, solver, found, found.evaluation.coefficients)
+        found = _from(problem, solver, found)
     return Ended(believed, found)
 
 
-def _from(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResult, start: Floats) -> SolverResult:
+def _from(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResult) -> SolverResult:
+    """Goes on from a result of which the problem may be a part of this one; its forces are the nearest of these."""
+    before, coefficients = found.local.problem, found.evaluation.coefficients
+    start = problem.carried(coefficients, before)
+    count = min(before.forces.size, problem.forces.size)
+    start[problem.force_part][:count] = coefficients[before.force_part][:count]
     return after(found, solver.solve(problem, start, found.evaluation, found.local.eta))
 
 

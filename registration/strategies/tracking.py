@@ -12,7 +12,7 @@ from ..policy import ACCURACY, POLICY
 from ..problem import Problem
 from ..result import Registration
 from ..setup import Ended, Setup
-from .cold_start import Localised, finish, from_rest
+from .cold_start import Localised, begin, finish
 
 
 def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
@@ -27,7 +27,7 @@ def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
     problem = setup.problem(points, prepared, last.evaluation.positions, last.rms_distance)
     near = problem.evaluation(problem.carried(last.evaluation.coefficients, last.problem), last.evaluation)
     if _is_nearer_at_rest(setup, near, last):  # the tool has let go: no way back through all states between
-        begun = from_rest(setup, points, prepared, setup.options.solver)
+        begun = begin(setup, points, prepared, setup.options.solver)
         return finish(setup, points, Localised(prepared, begun))
     solver = setup.options.solver.following().going_on(last.solved)
     if _is_as_expected(setup, problem, near, last):

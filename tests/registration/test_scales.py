@@ -55,6 +55,7 @@ def test_weighted_squares_of_normal_residuals_are_consistent(loss: Loss, rng) ->
     weights = loss.weight(x)
     # The deviation of this mean over 200,000 draws is below 0.4 %.
     assert (weights * x * x).sum() / weights.sum() == pytest.approx(loss.consistency, rel=0.02)
+    assert ((weights * x) ** 2).sum() / weights.sum() == pytest.approx(loss.shrinkage, rel=0.02)
 
 
 def test_losses_that_cannot_be_are_named() -> None:

@@ -32,10 +32,10 @@ def registrar(body: Body) -> Registrar:
     return Registrar(Cantilever(body, learned=2.0), SurfaceDistance(body, body.surfaces["observed"]), forces)
 
 
-def some_cloud(registrar: Registrar, seed: int) -> np.ndarray:
+def some_cloud(registrar: Registrar, seed: int, noise: float = NOISE) -> np.ndarray:
     rng, body = np.random.default_rng([5, seed]), registrar.model.body
     truth = registrar.model.solve(tip_forces(body, (0.0, *rng.uniform(-0.8, 0.8, 2)))).displacement
-    return cloud_on(body, truth, 400, rng, NOISE)
+    return cloud_on(body, truth, 400, rng, noise)
 
 
 def about_its_middle(cloud: np.ndarray, turn: float = 0.0, shift: float = 0.0, scale: float = 1.0) -> np.ndarray:
@@ -143,6 +143,17 @@ def test_what_shared_noise_may_explain_is_known_before_it_is_sought(registrar: R
 def test_noise_of_its_own_is_seldom_thought_to_be_shared(registrar: Registrar) -> None:
     gains = [gain_by_shared_noise(*least_squares(registrar, some_cloud(registrar, seed)))[0] for seed in range(20)]
     assert gains == [-np.inf] * 20
+
+
+def test_points_nearer_than_any_camera_sees_share_nothing(registrar: Registrar) -> None:
+    """Neighbours that are off alike by a twentieth of the least noise that is believed, as by a model's small error."""
+    waves = 10.0 * np.pi * np.random.default_rng(3).standard_normal((3, 3))
+    for seed in range(3):
+        cloud = some_cloud(registrar, seed, noise=1e-7)
+        found = registrar.register(cloud + 5e-6 * np.sin(cloud @ waves))
+        assert found.rms_distance < 0.1 * found.noise and found.shared_noise is None and found.local is not None
+        whole = found.problem.with_shared(CorrelatedNoise(registrar.observed.modes))
+        assert gain_by_shared_noise(found.local, whole)[0] == -np.inf
 
 
 def test_a_problem_without_shared_noise_gains_nothing(registrar: Registrar) -> None:
