@@ -16,6 +16,7 @@ from softtwin.reference.data.outcome import NotConverged
 from ..cloud import Cloud
 from ..gauss_newton import GaussNewton, SolverResult
 from ..lbfgs import LBFGS
+from ..outcome import Outcome
 from ..parameters.nodal_forces import localised, reweighting
 from ..policy import ACCURACY
 from ..prepared import Prepared
@@ -121,6 +122,8 @@ def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
     problem = setup.problem(points, believed, found.evaluation.positions, found.rms_distance)
     if setup.error is not None:
         found = _from(problem.unshared, solver.unsettled(), found)
+        if found.outcome is Outcome.CONVERGED:  # the convex loss has nothing left to do
+            solver = solver.directly()
         believed = _believed(setup, believed, found)
         problem = problem.with_forces(believed.forces)
     is_settled = begun.is_settled and believed is prepared and len(found.evaluation.cloud) == len(points)
