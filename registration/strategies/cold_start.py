@@ -75,9 +75,10 @@ def begin(
         solver: that ends it, where the model's error is not known in patterns.
         leading: as for `localise`.
     """
-    if setup.error is None:
-        return _from_rest(setup, points, prepared, solver, leading)
-    return _led(setup, points, prepared, leading)
+    begun = _led(setup, points, prepared, leading)
+    if setup.error is not None and not setup.is_hopeless(begun):
+        return begun
+    return _with_all(setup, points, prepared, solver, begun)
 
 
 def _carried_on(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResult, nodal: Floats) -> SolverResult:
@@ -98,10 +99,16 @@ def _from_rest(
     setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS, leading: int | None
 ) -> SolverResult:
     """First the leading directions alone, then all, the model's error taken for noise."""
-    begun, problem = _led(setup, points, prepared, leading), setup.plain(points, prepared)
-    if setup.is_hopeless(begun):  # what six directions leave as far off is no state of this organ
+    return _with_all(setup, points, prepared, solver, _led(setup, points, prepared, leading))
+
+
+def _with_all(
+    setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS, begun: SolverResult
+) -> SolverResult:
+    """All directions, from where the leading ones have ended."""
+    if setup.is_hopeless(begun):  # what six directions leave as far off is judged by what all would do, to first order
         solver = solver.without_steps()
-    return _from(problem, solver, begun)
+    return _from(setup.plain(points, prepared), solver, begun)
 
 
 def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:

@@ -65,7 +65,12 @@ def test_a_sequence_is_given_what_was_learned_between_two_frames(
     ):
         first, sequence = twin.network, Sequence(twin, "", is_live=True, learner=learner)
         numbers = iter(range(100_000))
-        until(lambda: twin.network is not first, lambda: sequence.register(clouds[next(numbers) % len(clouds)]))
+
+        def watch() -> None:
+            sequence.register(clouds[next(numbers) % len(clouds)])
+            time.sleep(0.3)  # learning is given way to frames, and would wait where they take all of a machine
+
+        until(lambda: twin.network is not first, watch)
         frame = sequence.register(clouds[3])
         sequence.close()
         assert frame.judgement.is_usable and twin.network.card["adaptation"]["kept_back"] >= 1

@@ -20,6 +20,7 @@ from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
 from softtwin.registration.parameters.discrepancy import ModelError, RemainderOfModelError
 from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.parameters.pose import PosePrior
+from softtwin.registration.policy import varied
 from softtwin.registration.pose import Pose
 from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import Registrar
@@ -118,6 +119,18 @@ def test_more_than_the_model_was_seen_to_get_wrong_is_doubtful(body: Body, rng, 
     result = registrar(body).register(cloud)
     assert result.judgement.verdict is verdict, (result.discrepancy_scale, result.judgement.reasons)
     assert any("seen to get wrong" in each for each in result.judgement.reasons) == (verdict is Verdict.DOUBTFUL)
+
+
+def test_what_few_directions_leave_far_off_is_found_with_all(body: Body, rng) -> None:
+    """The model's error is an unknown at once then, unless so much is left that no direction may explain it."""
+    plain = registrar(body)
+    options = replace(plain.options, localisation=replace(plain.options.localisation, rounds=0))
+    truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.8, -0.8))).displacement
+    with varied("leading", 1.0 / 6.0):
+        made = Registrar(Biased(body), plain.observed, plain.forces, options)
+        result = made.register(cloud_on(body, truth, 400, rng, 5e-4))
+    assert result.judgement.verdict is Verdict.ACCEPTED, result.judgement.reasons
+    assert np.linalg.norm(result.displacement - truth, axis=1).mean() < 1e-3
 
 
 def test_a_pull_of_an_unexpected_size_is_taken_for_no_turn(body: Body, rng) -> None:
