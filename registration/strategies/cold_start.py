@@ -144,7 +144,7 @@ def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
 
 
 def _from(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResult) -> SolverResult:
-    """Goes on from a result of which the problem may be a part of this one; its forces are the nearest of these."""
+    """Goes on from a result; its directions of force may be the first of this problem's, or all of them."""
     before, coefficients = found.local.problem, found.evaluation.coefficients
     start = problem.carried(coefficients, before)
     count = min(before.forces.size, problem.forces.size)
