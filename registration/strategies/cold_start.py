@@ -125,16 +125,18 @@ def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
     prepared, found, solver = begun.prepared, begun.found, setup.options.solver
     if setup.is_hopeless(found):
         solver = solver.without_steps()
-    believed = prepared if setup.error is not None else _believed(setup, prepared, found)
-    problem = setup.problem(points, believed, found.evaluation.positions, found.rms_distance)
-    if setup.error is not None:
+    if setup.error is None:
+        believed = _believed(setup, prepared, found)
+        problem = setup.plain(points, believed)
+        if not begun.is_settled or believed is not prepared or len(found.evaluation.cloud) < len(points):
+            found = _from(problem, solver, found)
+    else:
+        problem = setup.problem(points, prepared, found.evaluation.positions, found.rms_distance)
         found = _from(problem.unshared, solver.unsettled(), found)
         if found.outcome is Outcome.CONVERGED:  # the convex loss has nothing left to do
             solver = solver.directly()
-        believed = _believed(setup, believed, found)
+        believed = _believed(setup, prepared, found)
         problem = problem.with_forces(believed.forces)
-    is_settled = begun.is_settled and believed is prepared and len(found.evaluation.cloud) == len(points)
-    if setup.error is not None or not is_settled:
         found = _from(problem, solver, found)
     wider = _believed(setup, believed, found)
     if wider is not believed:  # seen only now that noise which neighbours share is told from each point's own

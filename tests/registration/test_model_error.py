@@ -20,7 +20,7 @@ from softtwin.registration.parameters.correlated_noise import CorrelatedNoise
 from softtwin.registration.parameters.discrepancy import ModelError, RemainderOfModelError
 from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.parameters.pose import PosePrior
-from softtwin.registration.policy import varied
+from softtwin.registration.policy import POLICY, varied
 from softtwin.registration.pose import Pose
 from softtwin.registration.problem import Problem
 from softtwin.registration.registrar import Registrar
@@ -114,11 +114,18 @@ def test_doubt_of_the_net_force_knows_of_the_models_error(body: Body) -> None:
 
 @pytest.mark.parametrize(("size", "verdict"), [(1.0, Verdict.ACCEPTED), (6.0, Verdict.DOUBTFUL)])
 def test_more_than_the_model_was_seen_to_get_wrong_is_doubtful(body: Body, rng, size: float, verdict: Verdict) -> None:
-    """Two patterns alone cannot say by how much: of four times as much a scale of 1.4 to 1.6 is believed."""
     cloud = cloud_on(body, true_displacement(body, np.array([size, -size])), 400, rng, 5e-4)
     result = registrar(body).register(cloud)
     assert result.judgement.verdict is verdict, (result.discrepancy_scale, result.judgement.reasons)
     assert any("seen to get wrong" in each for each in result.judgement.reasons) == (verdict is Verdict.DOUBTFUL)
+
+
+def test_two_patterns_alone_cannot_decide_about_the_level(body: Body, rng) -> None:
+    """Of four times what was seen the scale lies about the level of a doubt, by less than its own uncertainty."""
+    cloud = cloud_on(body, true_displacement(body, np.array([4.0, -4.0])), 400, rng, 5e-4)
+    local = registrar(body).register(cloud).solved.local
+    deviation = float(np.sqrt(local.evidence.covariance(local.eta)[DISCREPANCY, DISCREPANCY]))
+    assert abs(local.eta[DISCREPANCY] - np.log(POLICY.excess)) < 2.0 * deviation < 0.3
 
 
 def test_what_few_directions_leave_far_off_is_found_with_all(body: Body, rng) -> None:
