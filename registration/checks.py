@@ -204,7 +204,13 @@ def _left_out(problem: Problem, found: SolverResult) -> Iterator[Check]:
     motion = by_rigid_motion(local) if problem.pose is None else np.zeros((len(problem.cloud), 0))
     of_scale, of_pose = scores(local, by_scale(local), motion)
     if of_scale is not None:
-        yield _scored(Code.SCALE, of_scale, False, "")  # see `score.by_scale`: shown, and decides nothing
+        larger = float(of_scale.estimate[0])
+        matters = abs(larger) * problem.observed.body.size / 2.0 > problem.noise.median
+        another = (
+            f"the cloud fits better {100 * abs(larger):.1f} % {'larger' if larger > 0.0 else 'smaller'}: it has not the "
+            "scale of the organ; look at its unit, the calibration of the camera, or the segmentation"
+        )
+        yield _scored(Code.SCALE, of_scale, matters, another, POLICY.unlikely)
     if of_pose is not None:
         turn, shift = (float(np.linalg.norm(part)) for part in np.split(of_pose.estimate, 2))
         matters = max(turn * problem.observed.body.size / 2.0, shift) > problem.noise.median
@@ -212,12 +218,12 @@ def _left_out(problem: Problem, found: SolverResult) -> Iterator[Check]:
             f"the cloud fits better turned by {np.rad2deg(turn):.1f} degrees and shifted by {1e3 * shift:.1f} mm: the "
             "pose is not exact; say --pose unknown"
         )
-        yield _scored(Code.EXACT_POSE, of_pose, matters, odd)
+        yield _scored(Code.EXACT_POSE, of_pose, matters, odd, POLICY.unlikely_score)
 
 
-def _scored(code: Code, told: Score, matters: bool, reason: str) -> Check:
-    """A check by a score test; what is sure and too small to matter is passed."""
-    level = float(chdtri(len(told.estimate), POLICY.unlikely_score))
+def _scored(code: Code, told: Score, matters: bool, reason: str, unlikely: float) -> Check:
+    """A check by a score test, doubtful below a chance; what is sure and too small to matter is passed."""
+    level = float(chdtri(len(told.estimate), unlikely))
     law = f"chi-square, {len(told.estimate)} degrees of freedom", told.p_value
     made = checked(code, told.statistic, level, reason, law=law)
     return made if matters else replace(made, verdict=Verdict.ACCEPTED, level=None, reason="")

@@ -151,10 +151,11 @@ class _SharedNoise:
 def by_scale(local: LocalModel) -> Floats:
     """Derivative of the distances by the logarithm of the cloud's scale about its middle, (p, 1), metres.
 
-    Noise across a curved or coarse surface looks like a larger cloud: the score of a right one is not chi-square there.
-    Its law has to be drawn at the state before a verdict can be based on it.
+    It is taken where the points are on the surface, without their noise: with it the derivative and the distances
+    would hold the same noise, and each cloud would look larger than its organ, the more so the noisier it is.
     """
-    match, arms = local.evaluation.match, _arms(local)
+    match = local.evaluation.match
+    arms = _arms(local) + match.distances[:, None] * match.directions
     return -np.einsum("pi,pi->p", match.directions, arms)[:, None]
 
 
