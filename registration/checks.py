@@ -207,8 +207,8 @@ def _left_out(problem: Problem, found: SolverResult) -> Iterator[Check]:
         larger = float(of_scale.estimate[0])
         matters = abs(larger) * problem.observed.body.size / 2.0 > problem.noise.median
         another = (
-            f"the cloud fits better {100 * abs(larger):.1f} % {'larger' if larger > 0.0 else 'smaller'}: it has not the "
-            "scale of the organ; look at its unit, the calibration of the camera, or the segmentation"
+            f"the cloud fits better {100 * abs(larger):.1f} % {'larger' if larger > 0.0 else 'smaller'}: it has not "
+            "the scale of the organ; look at its unit, the calibration of the camera, or the segmentation"
         )
         yield _scored(Code.SCALE, of_scale, matters, another, POLICY.unlikely)
     if of_pose is not None:
