@@ -132,7 +132,7 @@ class Policy:
     unlikely_score: float = choice(
         1e-5,
         _CHANCE,
-        "the same of score tests: forces that are localised by the cloud that they explain leave larger ones than "
+        "the same of scores of pose and further terms: forces localised by the cloud that they explain leave more than "
         "chi-square has",
         "verdict, right clouds",
     )
@@ -246,8 +246,7 @@ class Accuracy:
         4,
         "",
         "directions of force that a cold start begins with",
-        "robustness, no zone, noise 1 mm (3, 4, 6, 12): 0.217, 0.219, 0.480, 0.216 mm: two states of s3 meet the side "
-        "that is seen; table 6.1, iterations: 8.1, 7.9, 7.9, 8.9",
+        "guards: robustness, surrogate, no zone, noise 1 mm: with six the wrong of two states of one sequence",
     )
     expansion_points: int = count(3, "", "exact states from which a fast model goes on")
     far: float = choice(

@@ -151,12 +151,11 @@ class _SharedNoise:
 def by_scale(local: LocalModel) -> Floats:
     """Derivative of the distances by the logarithm of the cloud's scale about its middle, (p, 1), metres.
 
-    It is taken where the points are on the surface, without their noise: with it the derivative and the distances
-    would hold the same noise, and each cloud would look larger than its organ, the more so the noisier it is.
+    Each point is taken where it is on the surface, without its noise. With it this derivative and the distances would
+    hold the same noise, and every cloud would look larger than its organ, the more so the noisier it is.
     """
     match = local.evaluation.match
-    arms = _arms(local) + match.distances[:, None] * match.directions
-    return -np.einsum("pi,pi->p", match.directions, arms)[:, None]
+    return -(np.einsum("pi,pi->p", match.directions, _arms(local)) + match.distances)[:, None]
 
 
 def by_rigid_motion(local: LocalModel) -> Floats:
