@@ -54,19 +54,6 @@ class SparseLocalisation:
 
 
 @dataclass(frozen=True)
-class ForceHyperprior:
-    """When the size of the forces is left to the cloud, whatever was expected of it.
-
-    Args:
-        clear: in clouds of less noise, metres.
-        spread: of the logarithm of the size then.
-    """
-
-    clear: float = 0.0
-    spread: float = field(default_factory=lambda: POLICY.spread_unknown)
-
-
-@dataclass(frozen=True)
 class RegistrationOptions:
     """How a cloud is trusted and by what it is registered.
 
@@ -75,7 +62,6 @@ class RegistrationOptions:
         solver: how the objective is minimised.
         maximum_points: larger clouds are thinned to so many points.
         localisation: how a cold start finds where forces act.
-        hyperprior: when the size of the forces is left to the cloud.
         distance: of points to the surface, or to the planes of its triangles; see `SurfaceDistance`.
         normal_deviation: standard deviation of a measured normal across itself, radians.
         correlated: reckon with noise that neighbouring points share; see `surface_modes`.
@@ -85,7 +71,6 @@ class RegistrationOptions:
     solver: GaussNewton | LBFGS = field(default_factory=GaussNewton)
     maximum_points: int = field(default_factory=lambda: ACCURACY.points)
     localisation: SparseLocalisation = field(default_factory=SparseLocalisation)
-    hyperprior: ForceHyperprior = field(default_factory=ForceHyperprior)
     distance: Distance = "surface"
     normal_deviation: float = NORMAL_DEVIATION
     correlated: bool = True
@@ -105,17 +90,15 @@ def options_for(model: ForwardModel, has_zone: bool) -> RegistrationOptions:
     """Options that suit a model.
 
     Within a zone forces are not gathered: what a cloud was used to believe it would be used to find once more, and
-    margins would be too narrow. An exact model is only as good as the end of the descent, and leaves it to clear
-    clouds to tell the size of the forces; what a surrogate gets wrong could be taken for large ones.
+    margins would be too narrow. An exact model looks for their place with all points: it is only as good as the end of
+    the descent.
 
     Args:
         model: forward model.
         has_zone: the nodes that may carry force are those that a tool can touch.
     """
     if model.error == 0.0:
-        clear = POLICY.excess * POLICY.noise_minimum
-        localisation = SparseLocalisation(rounds=0 if has_zone else POLICY.rounds, points=_MANY)
-        return RegistrationOptions(localisation=localisation, hyperprior=ForceHyperprior(clear))
+        return RegistrationOptions(localisation=SparseLocalisation(0 if has_zone else POLICY.rounds, points=_MANY))
     if has_zone:
         return RegistrationOptions(localisation=SparseLocalisation(rounds=0, points=_MANY))
     return RegistrationOptions()

@@ -76,14 +76,11 @@ class Policy:
         "standard deviation of the logarithm of what the model gets wrong over what it was seen to",
         "foreign_patches, raised by 10 mm: with 0.5 three of twelve frames take the patch for the model's error",
     )
-    spread_unknown: float = choice(
+    discrepancy_spread_below: float = choice(
         1.0,
         "",
-        "standard deviation of the logarithm of a scale of which little is known: of what the model gets wrong where "
-        "it is less than was seen, at a state near those that it knows well; of the size of a nodal force of an exact "
-        "model where the cloud is clear enough to tell it",
-        "misspecified, ensemble, ratio 0.45 to 0.49: with 0.25 the error is 0.25 in place of 0.22 mm; robustness, "
-        "reference, clean: a sharp pull of an unexpected size would be called outliers",
+        "the same where the model gets less wrong than was seen, at a state near those that it knows well",
+        "misspecified, ensemble, ratio 0.45 to 0.49: with 0.25 the error is 0.25 in place of 0.22 mm",
     )
     discrepancy_minimum: float = choice(
         0.5,
@@ -103,16 +100,11 @@ class Policy:
         0.01, "of Young's modulus times a squared edge", "median of a nodal force's size", "robustness, surrogate"
     )
     force_spread: float = choice(
-        0.35,
+        0.5,
         "",
         "standard deviation of the logarithm of a nodal force's size: with more, forces explain noise",
-        "robustness, surrogate: noise 5 mm (0.35, 0.5, 1.0: 0.52, 0.54, 0.64 mm)",
-    )
-    force_spread_anywhere: float = choice(
-        0.7,
-        "",
-        "the same of a model that errs, where no zone is told: forces gathered at a small place are larger",
-        "misspecified, surrogate: as it is; smaller values make it worse",
+        "guards: robustness, surrogate, no zone, noise 1 mm, where 0.7 takes a wrong state for right; misspecified, "
+        "surrogate: as it is, where 0.35 is worse",
     )
     force_reach: float = choice(
         0.02,
@@ -166,8 +158,7 @@ class Policy:
         1.5,
         "times what was to be expected",
         "so much above a level no result is of use; so much more than it was seen to be, the model's error explains "
-        "nothing; at so much larger distances than in the last frame a cloud is searched for from rest; with so much "
-        "of the least noise it is still clear",
+        "nothing; at so much larger distances than in the last frame a cloud is searched for from rest",
         "verdict: another organ, patch of 30 % by 10 mm; liver sequences: frames of changed places of force",
     )
     elsewhere: float = choice(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -56,8 +56,3 @@ class Prepared:
     def unseen(self) -> Floats:
         """Displacements by the directions of force that were left out, for unit scale, (3n, r)."""
         return unseen_response(self.model, self.forces)
-
-    def with_prior(self, spread: float) -> Prepared:
-        """The same with another spread of the logarithm of the forces' size."""
-        scale = replace(self.forces.scale, spread=spread)
-        return replace(self, forces=replace(self.forces, scale=scale))

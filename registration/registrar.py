@@ -363,9 +363,7 @@ def prepare(
     if along_normals:  # a pressure acts all over the surface
         options = replace(options, localisation=replace(options.localisation, rounds=0))
     observed = SurfaceDistance(model.body, triangles, options.distance)
-    is_anywhere = options.localisation.rounds > 0 and model.error > 0.0
-    spread = POLICY.force_spread_anywhere if is_anywhere else POLICY.force_spread
-    scale = LogNormalPrior(force_scale, spread, minimum=1e-2 * force_scale)
+    scale = LogNormalPrior(force_scale, POLICY.force_spread, minimum=1e-2 * force_scale)
     if nodes is None:
         if inputs is None and pose is None and blocks is None:
             raise ValueError("prepare.nodes: expected nodes that may carry force where nothing else is unknown.")

@@ -68,7 +68,7 @@ class ModelError(FieldBlock):
                 1.0,
                 POLICY.discrepancy_spread,
                 POLICY.discrepancy_minimum,
-                spread_below=POLICY.spread_unknown,
+                spread_below=POLICY.discrepancy_spread_below,
             )
         }
 

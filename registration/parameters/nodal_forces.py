@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lstsq
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.embedding import outer, outer_nodes
@@ -27,6 +28,7 @@ from .block import ParameterBlock
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 _SMALLEST_VARIANCE = 1e-5  # of a pattern of forces, relative to the largest: rougher ones are left out
+_MOST_PATTERNS = 300  # of one component: on a surface as large as a liver waves down to 1.4 smoothness lengths
 _WHOLE = 100.0  # of its changes, that a pressure presses a body as a whole: so much that nothing is believed of it
 _TANGENTIAL = 0.5  # weight of movements along the observed side: they become normal where it turns
 FORCE = LogNormalPrior(0.01, 2.0, minimum=1e-5)
@@ -149,8 +151,11 @@ def _net(patterns: Floats) -> Floats:
 def nodal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, smoothness: float = 0.0) -> NodalForces:
     """Three force components at every node of a zone.
 
-    With a smoothness length s, the forces of two nodes at distance d correlate by exp(-d^2 / 2 s^2), so that a smooth
-    pull is cheaper than a scattered one.
+    With a smoothness length s, the forces of two nodes at distance d correlate by exp(-d / s), so that a pull on a
+    patch is cheaper than a scattered one. What touches an organ does so on a patch with an edge: the power of a disc's
+    indicator falls as the third power of the wave number, and so does that of this correlation (Matern's of order 1/2
+    on a surface: Rasmussen and Williams 2006, 4.2). A smoother one takes the edge for impossible, and is too sure of
+    what it finds. Near d = 0 it falls as the overlap of a disc of radius 2 s / pi with itself moved by d.
 
     Args:
         body: the body.
@@ -162,7 +167,7 @@ def nodal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, sm
         ValueError: no node is left, or a smoothness that is negative.
     """
     chosen = _free_boundary("nodal_forces", body, nodes, smoothness)
-    root = _correlation_root(body.points[chosen], smoothness)
+    root = _correlation_root(body.points[chosen], smoothness, lambda lengths: np.exp(-lengths))
     return NodalForces(chosen, np.kron(root, np.eye(3)), len(body.points), scale)
 
 
@@ -171,8 +176,9 @@ def normal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, s
 
     So what surrounds an organ acts that is not grown together with it, as ribs and diaphragm on a lung. The pressure is
     a part that is the same all over, one that depends on where the surface faces, n' S n for a unit normal n and a
-    symmetric S without trace, and smooth changes. Of the first two nothing is believed: they press and stretch
-    the organ as a whole, and go on where no point is seen, as changes, which are local, do not.
+    symmetric S without trace, and smooth changes: what surrounds an organ has no edge, and those of two nodes at
+    distance d correlate by exp(-d^2 / 2 s^2). Of the first two nothing is believed: they press and stretch the organ as
+    a whole, and go on where no point is seen, as changes, which are local, do not.
 
     Args:
         body: the body.
@@ -187,7 +193,7 @@ def normal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, s
     surface = outer(body)
     normals = surface.along_normals(np.ones(len(surface.rest.points)))[chosen]
     normals /= np.linalg.norm(normals, axis=1).mean()
-    pressures = _correlation_root(body.points[chosen], smoothness)
+    pressures = _correlation_root(body.points[chosen], smoothness, lambda lengths: np.exp(-0.5 * lengths**2))
     pressures = np.hstack([np.full((len(chosen), 1), _WHOLE), _WHOLE * _by_facing(normals), pressures])
     patterns = normals[:, :, None] * pressures[:, None, :]
     return NodalForces(chosen, patterns.reshape(3 * len(chosen), -1), len(body.points), scale)
@@ -228,14 +234,20 @@ def known_forces(body: Body, scale: LogNormalPrior = FORCE) -> NodalForces:
     return NodalForces(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), len(body.points), scale)
 
 
-def _correlation_root(positions: Floats, smoothness: float) -> Floats:
-    """Independent patterns of nodal forces, (a, m), whose covariance is the correlation; few where it is smooth."""
+def _correlation_root(positions: Floats, smoothness: float, correlation: Callable[[Floats], Floats]) -> Floats:
+    """Independent patterns of nodal forces, (a, m), whose covariance is the correlation; few where it is smooth.
+
+    Args:
+        positions: of the nodes, (a, 3), metres.
+        smoothness: correlation length, metres; 0 for independent nodes.
+        correlation: of two nodes by their distance in correlation lengths.
+    """
     if smoothness <= 0.0:
         return np.eye(len(positions))
-    squared = ((positions[:, None] - positions[None]) ** 2).sum(axis=2)
-    correlation = np.exp(-squared / (2.0 * smoothness**2))
-    variances, modes = np.linalg.eigh(correlation)
+    lengths = cdist(positions, positions) / smoothness
+    variances, modes = np.linalg.eigh(correlation(lengths))
     kept = variances > _SMALLEST_VARIANCE * variances[-1]
+    kept[:-_MOST_PATTERNS] = False
     return modes[:, kept] * np.sqrt(variances[kept])
 
 

@@ -96,10 +96,6 @@ class ParameterStack:
         """Noise that neighbouring points share; None where each point errs by itself."""
         return self.block(CorrelatedNoise)
 
-    def with_forces(self, forces: NodalForces) -> Self:
-        """The same with other nodal forces in the place of these, as many."""
-        return replace(self, blocks=tuple(forces if block is self.forces else block for block in self.blocks))
-
     def with_shared(self, shared: CorrelatedNoise | None) -> Self:
         """The same with other noise that neighbours share, or without: its coefficients come last."""
         others = tuple(block for block in self.blocks if not isinstance(block, CorrelatedNoise))

@@ -114,8 +114,7 @@ def _with_all(
 def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
     """With all points, and with the model's error in patterns, from a result that took it for noise.
 
-    The forces' size and noise that neighbours share are asked for where the search has nearly ended: before that all
-    are off alike.
+    Noise that neighbours share is asked for where the search has nearly ended: before that all are off alike.
 
     Args:
         setup: what is registered.
@@ -126,23 +125,14 @@ def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
     if setup.is_hopeless(found):
         solver = solver.without_steps()
     if setup.error is None:
-        believed = _believed(setup, prepared, found)
-        problem = setup.plain(points, believed)
-        if not begun.is_settled or believed is not prepared or len(found.evaluation.cloud) < len(points):
-            found = _from(problem, solver, found)
-    else:
-        problem = setup.problem(points, prepared, found.evaluation.positions, found.rms_distance)
-        found = _from(problem.unshared, solver.unsettled(), found)
-        if found.outcome is Outcome.CONVERGED:  # the convex loss has nothing left to do
-            solver = solver.directly()
-        believed = _believed(setup, prepared, found)
-        problem = problem.with_forces(believed.forces)
-        found = _from(problem, solver, found)
-    wider = _believed(setup, believed, found)
-    if wider is not believed:  # seen only now that noise which neighbours share is told from each point's own
-        believed, problem = wider, problem.with_forces(wider.forces)
-        found = _from(problem, solver, found)
-    return Ended(believed, found)
+        if not begun.is_settled or len(found.evaluation.cloud) < len(points):
+            found = _from(setup.plain(points, prepared), solver, found)
+        return Ended(prepared, found)
+    problem = setup.problem(points, prepared, found.evaluation.positions, found.rms_distance)
+    found = _from(problem.unshared, solver.unsettled(), found)
+    if found.outcome is Outcome.CONVERGED:  # the convex loss has nothing left to do
+        solver = solver.directly()
+    return Ended(prepared, _from(problem, solver, found))
 
 
 def _from(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResult) -> SolverResult:
@@ -152,14 +142,6 @@ def _from(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResult) ->
     count = min(before.forces.size, problem.forces.size)
     start[problem.force_part][:count] = coefficients[before.force_part][:count]
     return after(found, solver.solve(problem, start, found.evaluation, found.local.eta))
-
-
-def _believed(setup: Setup, prepared: Prepared, found: SolverResult) -> Prepared:
-    """The forces' size as the cloud tells it, where it can: what was expected would call a sharp pull outliers."""
-    hyperprior = setup.options.hyperprior
-    if found.local.noise >= hyperprior.clear or prepared.forces.scale.spread >= hyperprior.spread:
-        return prepared
-    return prepared.with_prior(hyperprior.spread)
 
 
 def _gathered(setup: Setup, nodal: Floats) -> Prepared:

@@ -184,7 +184,7 @@ def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(body: Body, rng: np.ra
 
     def mean(scale: float) -> Floats:
         forces = replace(local.problem.forces, scale=LogNormalPrior(scale, 0.0))
-        known = local.problem.with_forces(forces)
+        known = replace(local.problem, blocks=(forces, *local.problem.blocks[1:]))
         held = LocalModel(known, local.evaluation, Square(), local.noise, point_noise=local.point_noise)
         return held.evaluation.coefficients - held.solved(held.gradient[:, None])[:, 0]
 
