@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from softtwin.meshes.body import Body
+from softtwin.meshes.shapes import beam
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hyperparameters import LogNormalPrior
@@ -203,6 +204,22 @@ def test_smooth_forces_correlate_and_keep_their_scale(body: Body) -> None:
     assert covariance[first, 0, first, 0] == pytest.approx(1.0, rel=2e-3)
     assert covariance[first, 0, second, 1] == 0.0
     assert covariance[first, 2, second, 2] > 0.5
+
+
+@pytest.mark.parametrize("smoothness", [0.05, 0.1])
+@pytest.mark.parametrize("radius", [0.04, 0.06, 0.09])
+def test_a_pull_on_a_patch_with_an_edge_is_a_likely_one(radius: float, smoothness: float) -> None:
+    """What it takes of smooth and of rough patterns is of one size, as of a draw; a smoother law takes tenfold."""
+    body = beam((40, 10, 10), (0.8, 0.2, 0.2), "tetrahedron")
+    top = np.setdiff1d(np.flatnonzero(body.points[:, 2] > 0.2 - 1e-9), body.fixed)
+    forces = nodal_forces(body, top, smoothness=smoothness)
+    pull = np.zeros_like(body.points)
+    pull[top[np.linalg.norm(body.points[top] - [0.4, 0.1, 0.2], axis=1) < radius], 2] = 1.0
+    found = forces.nearest(pull)[2::3]
+    assert np.linalg.norm(forces.forces(forces.nearest(pull)) - pull) < 0.3 * np.linalg.norm(pull)
+    told = found[np.abs(found) > 1e-9]  # others are of another symmetry
+    rough, smooth = told[: len(told) // 3], told[-(len(told) // 3) :]
+    assert 0.5 < np.sqrt(np.mean(rough**2) / np.mean(smooth**2)) < 2.0
 
 
 def test_zones_inside_or_fixed_are_refused(body: Body) -> None:
