@@ -240,7 +240,7 @@ class SamplesSection(Section):
     )
     smooth: int = option(
         0,
-        "draws of smooth forces on a patch, as registration expects them, to see what the surrogate gets wrong under "
+        "draws of smooth forces on a patch, rougher than modal loads, to see what the surrogate gets wrong under "
         "such; 0: it is seen under the validation draws alone",
         ge=0,
     )

@@ -80,7 +80,7 @@ class Plan:
         loads: how loads are drawn.
         samples: draws of each split; `calibration` may be left out, and so may `active`: whole blocks of draws that are
             learned from, too, once `write_chosen` has said which of the `candidate_loads` they are; `smooth` ones are
-            loads as registration expects them, which say what a model gets wrong there.
+            loads that are rougher than modal ones, which say what a model gets wrong there.
         block: draws of one block, the unit of work and of storage.
         ramp: draws that share one load at growing sizes, each solved from the one before; divides `block`. Several
             times cheaper a draw than independent loads where these need many Newton iterations from rest.

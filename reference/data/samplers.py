@@ -178,10 +178,11 @@ def draw_load(body: Body, shapes: Floats, plan: LoadPlan, rng: Chance) -> Floats
 
 
 def draw_smooth_load(body: Body, plan: LoadPlan, rng: np.random.Generator) -> Floats:
-    """One unscaled load as registration expects forces: a Gaussian field on a patch, (n, 3).
+    """One unscaled load of smooth forces: a Gaussian field on a patch, (n, 3).
 
     The forces of two places at distance d correlate by exp(-d^2 / 2 s^2) with s the plan's smoothness; components are
     independent. These loads are rougher than modal ones: what a model gets wrong under them, modal loads do not show.
+    Registration expects rougher ones still: those of a patch with an edge.
 
     Args:
         body: the body.

@@ -71,21 +71,24 @@ def test_loads_are_a_function_of_their_seed(modal) -> None:
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
-def test_smooth_loads_have_the_correlation_that_registration_expects() -> None:
-    """Over many draws of the same patch: exp(-d^2 / 2 s^2) between nodes, none between components."""
+def test_smooth_loads_have_the_correlation_that_is_said() -> None:
+    """Over many draws of the same patch: exp(-d^2 / 2 s^2) between nodes, none between components.
+
+    Registration's forces have exp(-d / s): smooth draws are as likely there, and the edge of a tool is, too.
+    """
     body = beam((4, 4, 4), (0.06, 0.06, 0.06), "tetrahedron")
     plan = LoadPlan(radius=(2.0, 2.0), smoothness=0.02)  # each patch is the whole free boundary
     draws = np.stack([draw_smooth_load(body, plan, np.random.default_rng(i)) for i in range(2000)])
     nodes = loaded_nodes(body, plan)
     assert np.abs(draws[:, np.setdiff1d(np.arange(len(body.points)), nodes)]).max() == 0.0
-    apart = ((body.points[nodes][:, None] - body.points[nodes]) ** 2).sum(axis=2)
-    prior = nodal_forces(body, nodes, smoothness=0.02)
-    root = prior.patterns[::3, ::3]
-    np.testing.assert_allclose(root @ root.T, np.exp(-apart / (2.0 * 0.02**2)), atol=1e-4)
+    apart = np.linalg.norm(body.points[nodes][:, None] - body.points[nodes], axis=2)
+    prior = nodal_forces(body, nodes, smoothness=0.02).patterns[::3, ::3]
+    np.testing.assert_allclose(prior @ prior.T, np.exp(-apart / 0.02), atol=1e-4)
+    said = np.exp(-(apart**2) / (2.0 * 0.02**2))
     for axis in range(3):
         one = draws[:, nodes, axis]
         # The mean of 2,000 products of unit variance is off by 1 / sqrt(2000): five times that, over all pairs.
-        assert np.abs(one.T @ one / len(one) - root @ root.T).max() < 5.5 * np.sqrt(2.0 / len(one))
+        assert np.abs(one.T @ one / len(one) - said).max() < 5.5 * np.sqrt(2.0 / len(one))
         assert np.abs(one.T @ draws[:, nodes, axis - 1] / len(one)).max() < 5.5 / np.sqrt(len(one))
 
 
