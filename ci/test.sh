@@ -30,7 +30,7 @@ if [ "${1:-}" = --all ]; then
 fi
 ASKED=("$@")
 NAMES=()
-WORKERS=${SOFTTWIN_TEST_WORKERS:-3} # on two cores: one of them often waits for a program or the disk
+WORKERS=${SOFTTWIN_TEST_WORKERS:-2}
 
 asked() { [ ${#ASKED[@]} = 0 ] || [[ " ${ASKED[*]} " == *" $1 "* ]]; }
 
