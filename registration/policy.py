@@ -89,11 +89,11 @@ class Policy:
         "robustness, surrogate (0.3, 0.5, 0.75): clean 0.229, 0.225, 0.238 mm; pose off 0.50, 0.39, 0.39 mm",
     )
     discrepancy_in_margins: float = choice(
-        0.6,
+        0.3,
         "of its logarithm",
         "part of a scale found below 1 that margins believe: forces explain some of what the model gets wrong",
-        "guards: robustness, surrogate, clean: with 0.3 margins hold too many nodes, with 1 the net force's region "
-        "is too small",
+        "guards: robustness, surrogate: nodes in their margins; 0 holds too many of a clean cloud; with 0.6 the net "
+        "force's region is too small",
     )
 
     # What is believed of the forces.
