@@ -104,8 +104,7 @@ class Policy:
         0.5,
         "",
         "standard deviation of the logarithm of a nodal force's size: with more, forces explain noise",
-        "guards: robustness, surrogate, no zone, noise 1 mm, where 0.7 takes a wrong state for right; misspecified, "
-        "surrogate: as it is, where 0.35 is worse",
+        "guards: robustness, surrogate, no zone, noise 1 mm; misspecified, surrogate: as it is",
     )
     force_reach: float = choice(
         0.02,

@@ -167,7 +167,7 @@ def nodal_forces(body: Body, nodes: ArrayLike, scale: LogNormalPrior = FORCE, sm
         ValueError: no node is left, or a smoothness that is negative.
     """
     chosen = _free_boundary("nodal_forces", body, nodes, smoothness)
-    root = _correlation_root(body.points[chosen], smoothness, lambda lengths: np.exp(-lengths))
+    root = _correlation_root(body.points[chosen], smoothness, lambda lengths: np.exp(-lengths), _MOST_PATTERNS)
     return NodalForces(chosen, np.kron(root, np.eye(3)), len(body.points), scale)
 
 
@@ -234,20 +234,24 @@ def known_forces(body: Body, scale: LogNormalPrior = FORCE) -> NodalForces:
     return NodalForces(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), len(body.points), scale)
 
 
-def _correlation_root(positions: Floats, smoothness: float, correlation: Callable[[Floats], Floats]) -> Floats:
+def _correlation_root(
+    positions: Floats, smoothness: float, correlation: Callable[[Floats], Floats], most: int | None = None
+) -> Floats:
     """Independent patterns of nodal forces, (a, m), whose covariance is the correlation; few where it is smooth.
 
     Args:
         positions: of the nodes, (a, 3), metres.
         smoothness: correlation length, metres; 0 for independent nodes.
         correlation: of two nodes by their distance in correlation lengths.
+        most: patterns, the smoothest ones; None for all. Of a law with edges too many are not small.
     """
     if smoothness <= 0.0:
         return np.eye(len(positions))
     lengths = cdist(positions, positions) / smoothness
     variances, modes = np.linalg.eigh(correlation(lengths))
     kept = variances > _SMALLEST_VARIANCE * variances[-1]
-    kept[:-_MOST_PATTERNS] = False
+    if most is not None:
+        kept[:-most] = False
     return modes[:, kept] * np.sqrt(variances[kept])
 
 

@@ -25,6 +25,7 @@ from softtwin.registration.parameters.nodal_forces import (
     NodalForces,
     localised,
     nodal_forces,
+    normal_forces,
     reweighting,
 )
 from softtwin.registration.parameters.pose import PosePrior
@@ -220,6 +221,17 @@ def test_a_pull_on_a_patch_with_an_edge_is_a_likely_one(radius: float, smoothnes
     told = found[np.abs(found) > 1e-9]  # others are of another symmetry
     rough, smooth = told[: len(told) // 3], told[-(len(told) // 3) :]
     assert 0.5 < np.sqrt(np.mean(rough**2) / np.mean(smooth**2)) < 2.0
+
+
+def test_of_a_large_zone_the_smoothest_patterns_are_kept_and_of_a_pressure_all() -> None:
+    """Rough patterns of forces with an edge are many and move little; a pressure's are few where it is smooth."""
+    body = beam((20, 6, 6), (0.8, 0.2, 0.2), "tetrahedron")
+    zone = np.setdiff1d(body.boundary_nodes, body.fixed)
+    forces, pressure = (make(body, zone, smoothness=0.02) for make in (nodal_forces, normal_forces))
+    assert forces.size == 3 * 300 < 3 * len(zone)
+    assert pressure.size == 6 + len(zone)
+    carried = np.square(forces.patterns).sum(axis=1)
+    assert 0.5 < carried.mean() < 1.0 and carried.max() < 1.0 + 1e-9
 
 
 def test_zones_inside_or_fixed_are_refused(body: Body) -> None:
