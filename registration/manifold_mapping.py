@@ -43,6 +43,23 @@ class ManifoldMapping:
         offset = exact.full.displacement - own.full.displacement
         return cls(fast, nodes, expansion_point, offset, exact.jacobian(every) - own.jacobian(every))
 
+    def onward(self, coefficients: Floats, exact: ReducedState, most: float) -> ManifoldMapping:
+        """Moved to another exact state, whose slopes are these, mended by what both states tell (Broyden 1965).
+
+        Args:
+            coefficients: of it, (k,).
+            exact: it, seen at the same nodes.
+            most: where these slopes missed more than this part of what lies between both states, its own are taken.
+        """
+        guess, way = self.solve(coefficients), coefficients - self.expansion_point
+        missed = (exact.positions - guess.positions).ravel()
+        moved = (exact.positions - self.solve(self.expansion_point).positions).ravel()
+        if np.linalg.norm(missed) > most * np.linalg.norm(moved):
+            return self.at(self.fast, self.nodes, coefficients, exact)
+        offset = exact.full.displacement - guess.own.full.displacement
+        slopes = self.slopes + np.outer(missed, way) / max(float(way @ way), 1e-300)
+        return ManifoldMapping(self.fast, self.nodes, coefficients, offset, slopes)
+
     @property
     def count(self) -> int:
         """Number of coefficients."""
@@ -94,6 +111,115 @@ class ManifoldMappingState:
         """First-order displacement of every so-manieth chosen node, (p, 3)."""
         added = (self.model.slopes @ change).reshape(-1, 3)
         return self.own.moved(change, every) + added[::every]
+
+
+@dataclass(frozen=True, eq=False)
+class MendedState:
+    """An exact reduced state with the slopes that a mapping has there: no derivative is made anew at the chosen nodes.
+
+    Args:
+        exact: the state.
+        mapped: the mapping's.
+    """
+
+    exact: ReducedState
+    mapped: ManifoldMappingState
+
+    @property
+    def positions(self) -> Floats:
+        """Displacement of the chosen nodes, (p, 3), metres."""
+        return self.exact.positions
+
+    @property
+    def full(self) -> State:
+        """The whole state, with its own slopes."""
+        return self.exact.full
+
+    def jacobian(self, rows: csr_array) -> Floats:
+        """As the mapping has it."""
+        return self.mapped.jacobian(rows)
+
+    def moved(self, change: Floats, every: int = 1) -> Floats:
+        """As the mapping has it."""
+        return self.mapped.moved(change, every)
+
+
+@dataclass(frozen=True, eq=False)
+class Still:
+    """A reduced model of a body that nothing moves: mapped to an exact state, it is the tangent there.
+
+    Args:
+        count: number of coefficients, k.
+        chosen: number of chosen nodes, p.
+        nodes: number of the body's, n.
+    """
+
+    count: int
+    chosen: int
+    nodes: int
+
+    def combined(self, matrix: Floats) -> Still:
+        """The same for other combinations of the forces."""
+        return Still(matrix.shape[1], self.chosen, self.nodes)
+
+    def solve(self, coefficients: Floats, near: Any = None) -> StillState:
+        """At rest."""
+        return StillState(self)
+
+
+@dataclass(frozen=True, eq=False)
+class StillState:
+    """Rest, whatever acts.
+
+    Args:
+        model: of which.
+    """
+
+    model: Still
+
+    @property
+    def positions(self) -> Floats:
+        """Zeros, (p, 3)."""
+        return np.zeros((self.model.chosen, 3))
+
+    @property
+    def full(self) -> StillBody:
+        """The whole body."""
+        return StillBody(self.model.nodes)
+
+    def jacobian(self, rows: csr_array) -> Floats:
+        """Zeros, (q, k)."""
+        return np.zeros((rows.shape[0], self.model.count))
+
+    def moved(self, change: Floats, every: int = 1) -> Floats:
+        """Zeros, (p, 3)."""
+        return self.positions[::every]
+
+
+@dataclass(frozen=True)
+class StillBody:
+    """A whole body at rest.
+
+    Args:
+        count: number of its nodes, n.
+    """
+
+    count: int
+    negative_pivots: None = None
+    extrapolation_ratio: None = None
+
+    @property
+    def displacement(self) -> Floats:
+        """Zeros, (n, 3)."""
+        return np.zeros((self.count, 3))
+
+    def jvp(self, changes: ArrayLike) -> Floats:
+        """Zeros."""
+        return np.zeros_like(np.asarray(changes, dtype=np.float64))
+
+    def vjp(self, cotangent: ArrayLike) -> Floats:
+        """Zeros."""
+        return np.zeros_like(np.asarray(cotangent, dtype=np.float64))
 
 
 @dataclass(frozen=True, eq=False)

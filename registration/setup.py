@@ -110,6 +110,11 @@ class Setup:
         unlocalised = Prepared.of(model, observed, forces, inputs)
         return cls(model, observed, forces, options, usual, noise, pose, inputs, blocks, (), error, unlocalised)
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether the model gets nothing wrong: each state of it costs much."""
+        return self.model.error == 0.0
+
     def with_solver(self, **given: object) -> Setup:
         """The same with other values of the solver."""
         solver: GaussNewton | LBFGS = replace(self.options.solver, **given)  # type: ignore[arg-type]

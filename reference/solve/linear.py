@@ -156,7 +156,8 @@ class LinearSolver:
         self.ksp.setUp()
 
     @property
-    def _cannot_solve(self) -> bool:
+    def cannot_solve(self) -> bool:
+        """Whether what was factored last is singular."""
         if self._band is not None:
             return self._band.has_failed
         return self.method != "multigrid" and _has_failed(self.ksp)
@@ -179,7 +180,7 @@ class LinearSolver:
         """
         self.tighten()
         self.prepare()
-        if self._cannot_solve:
+        if self.cannot_solve:
             raise RuntimeError("LinearSolver.solve: expected a matrix that can be inverted, got a singular one.")
         if self._band is not None:
             return self._band.solve(rows)

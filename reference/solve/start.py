@@ -123,15 +123,40 @@ class Starts:
             return Start(start if turned is None else turned, "guess", may_leave=False), True
         gap = self._forms.residual(start, load)
         gap[self._space.fixed] = 0.0
-        step = -self._system.tangent.solve(*self._system.point(guess), gap[None])[0]
-        at, ahead = self._merit(start, load), self._merit(start + step, load)
-        promised = at if self._space.mixed else -0.5 * self._space.dot(gap, step)
-        if 0.0 <= _TRUSTED * promised <= at - ahead:
+        at, tangent = self._merit(start, load), self._system.tangent
+        solved = tangent.solve_as_it_is(load, gap[None])  # it may be near enough, and saves a factorisation
+        if solved is not None:
+            step = -solved[0]
+            if self._keeps(start, step, gap, at, load)[0] and self._shrinks(start + step, gap, load):
+                return Start(start + step, "guess", may_leave=False, has_tangent=True), True
+        step = -tangent.solve(*self._system.point(guess), gap[None])[0]
+        is_kept, ahead = self._keeps(start, step, gap, at, load)
+        if is_kept:
             return Start(start + step, "guess", may_leave=False, has_tangent=True), True
         turned = self._turned(guess, path)
         if turned is not None:
             return Start(turned, "guess", may_leave=False), True
         return Start(start + step if ahead < at else start, "guess"), False
+
+    def _keeps(self, start: Floats, step: Floats, gap: Floats, merit: float, load: DiscreteLoad) -> tuple[bool, float]:
+        """Whether a step leads as far down as its tangent promises, and the merit where it leads.
+
+        Args:
+            start: unknowns.
+            step: from there.
+            gap: the residual there.
+            merit: there.
+            load: that is wanted.
+        """
+        ahead = self._merit(start + step, load)
+        promised = merit if self._space.mixed else -0.5 * self._space.dot(gap, step)
+        return bool(0.0 <= _TRUSTED * promised <= merit - ahead), ahead
+
+    def _shrinks(self, unknowns: Floats, gap: Floats, load: DiscreteLoad) -> bool:
+        """Whether less is left of a residual: further steps with the same tangent go on from there."""
+        left = self._forms.residual(unknowns, load)
+        left[self._space.fixed] = 0.0
+        return bool(self._space.norm(left) < self._space.norm(gap))
 
     def _turned(self, guess: ArrayLike | Equilibrium, path: LoadPath) -> Floats | None:
         """The guess turned as held nodes turn from there; None where they do not, or where that folds a cell."""

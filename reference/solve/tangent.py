@@ -80,6 +80,16 @@ class Tangent:
         self.linearise(unknowns, load)
         return self.linear.solve(right, transpose)
 
+    def solve_as_it_is(self, load: DiscreteLoad, rows: Floats) -> Floats | None:
+        """K^-1 of whatever state was assembled last applied to each row, (k, owned unknowns), zero on held ones.
+
+        None where there is none, it suits no such load or is singular, or where nothing is factored (multigrid).
+        """
+        if not self.is_known or self.linear.method == "multigrid" or self.symmetric != self.forms.is_conservative(load):
+            return None
+        self.linear.prepare()
+        return None if self.linear.cannot_solve else self.linear.solve(rows)
+
     def negative_pivots(self, unknowns: Floats, load: DiscreteLoad) -> int | None:
         """Negative pivots at a state, less those that pressures bring; None where they are not known."""
         if self.linear.method == "multigrid":

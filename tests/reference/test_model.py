@@ -175,6 +175,25 @@ def test_a_following_state_is_found_with_the_factorisation_of_the_one_before(box
     np.testing.assert_allclose(near.displacement, alone.displacement, atol=1e-7)
 
 
+def test_a_neighbour_is_found_with_whatever_is_factored_where_that_leads_down(box: Body) -> None:
+    """Of another neighbour, say; a tangent that is too far off is left aside, and so is a singular one."""
+    with Problem(box, NeoHookean(5000.0, 0.4)) as problem:
+        model = ReferenceModel(problem)
+        first, second = model.solve(tip_force(box, 0.4)), model.solve(tip_force(box, 0.402))
+        wanted = model.solve(tip_force(box, 0.404)).displacement
+        first.jvp(tip_force(box).reshape(-1, 1))  # factored there, and not at the second
+        near = model.solve(tip_force(box, 0.404), near=second)
+        assert near.equilibrium.factorisations == 0
+        np.testing.assert_allclose(near.displacement, wanted, atol=1e-7)
+        far = model.solve(tip_force(box, 1.6))
+        far.jvp(tip_force(box).reshape(-1, 1))
+        near = model.solve(tip_force(box, 0.404), near=second)
+        np.testing.assert_allclose(near.displacement, wanted, atol=1e-7)
+        problem.system.tangent.matrix.zeroEntries()
+        near = model.solve(tip_force(box, 0.404), near=first)
+        np.testing.assert_allclose(near.displacement, wanted, atol=1e-7)
+
+
 def test_another_models_state_is_a_start(box: Body) -> None:
     """A surrogate's, for instance: all that is asked of it is its displacement."""
     forces = tip_force(box, 0.8)
