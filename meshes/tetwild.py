@@ -18,7 +18,7 @@ from tqdm import tqdm
 from .body import Floats, Ints, Surface
 from .checks import SurfaceError
 
-_STOP_ENERGY = 10.0  # below 8 it halves cells without end; what 10 leaves bad, smoothing.improved mends
+_PROCESS = "softtwin.meshes.tetwild_process"
 
 
 def tetrahedra(surface: Surface, edge_length: float, tolerance: float) -> tuple[Floats, Ints]:
@@ -50,7 +50,7 @@ def tetrahedra(surface: Surface, edge_length: float, tolerance: float) -> tuple[
             edge_length=edge_length / size,
             tolerance=tolerance / size,
         )
-        program = [sys.executable, "-m", __name__, str(given), str(made)]
+        program = [sys.executable, "-m", _PROCESS, str(given), str(made)]
         code, errors = _run(program, folder)
         if code != 0 or not made.exists():
             raise SurfaceError(
@@ -78,30 +78,3 @@ def _run(program: list[str], folder: str) -> tuple[int, str]:
             run.kill()
             raise
     return run.returncode, errors
-
-
-def _main(given: str, made: str) -> None:
-    from pytetwild.pytetwild import tetrahedralize  # of the extra `mesh`
-
-    with np.load(given) as surface:
-        points, cells = tetrahedralize(
-            surface["points"],
-            surface["triangles"],
-            edge_length_abs=float(surface["edge_length"]),
-            epsilon=float(surface["tolerance"]),
-            stop_energy=_STOP_ENERGY,
-            num_threads=1,  # more gain nothing: smoothing and collapsing are serial
-            vtk_ordering=True,
-        )
-    corners = points[cells]
-    volumes = np.einsum(
-        "mi,mi->m",
-        corners[:, 1] - corners[:, 0],
-        np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 0]),
-    )
-    cells[volumes < 0] = cells[volumes < 0][:, [0, 2, 1, 3]]
-    np.savez(made, points=points, cells=cells[volumes != 0])
-
-
-if __name__ == "__main__":
-    _main(*sys.argv[1:])

@@ -216,6 +216,7 @@ class _Search:
         self.noise = max(robust_deviation(self.evaluation.match.distances), problem.noise.minimum)
         self.point_noise, self.begun, self.comparable = 0.0, 0, 0
         self.takes_last = options.graduation > 0.0
+        self.is_at_edge = False  # the model has refused states ahead: steps along the edge of those it has are short
         self.eta, self.starts = eta, list[Floats]()
         self.trace: list[IterationRecord] = []
         self._at: LocalModel | None = None
@@ -223,6 +224,11 @@ class _Search:
     @property
     def _first_limit(self) -> float:
         return self.options.max_step * self.problem.observed.body.size
+
+    @property
+    def _gained_by_settled(self) -> float:
+        """What the objective falls by in a step that counts as settled."""
+        return 0.5 * self.problem.size * self.options.settled**2
 
     def run(self) -> SolverResult:
         options = self.options
@@ -371,16 +377,20 @@ class _Search:
         unsolved = False
         while self.limit > self.options.minimum_step:
             change, largest = local.step(self.limit)
+            promised = local.decrease(change)
+            if self.is_at_edge and not local.is_undamped and promised < self._gained_by_settled:
+                break
             try:
                 self.evaluations += 1
                 evaluation = self.problem.evaluation(self.evaluation.coefficients + change, self.evaluation)
                 value = local.objective(evaluation, loss)
-                gain = (local.value - value) / local.decrease(change)
+                gain = (local.value - value) / promised
             except NotConverged:
-                unsolved, gain, value = True, -1.0, np.inf
+                unsolved = self.is_at_edge = True
+                gain, value = -1.0, np.inf
             self.limit = _next_limit(self.limit, largest, gain)
             if gain > 0.0:
-                self.evaluation = evaluation
+                self.evaluation, self.is_at_edge = evaluation, self.is_at_edge and not local.is_undamped
                 if self.options.is_near and local.is_undamped and abs(gain - 1.0) < ACCURACY.kept:
                     self._at = local.moved_to(evaluation)
                 self.trace.append(

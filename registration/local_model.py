@@ -227,7 +227,7 @@ class LocalModel:
         values, vectors = self._eigen
         root = 1.0 / np.sqrt(self.precision)
         rotated = vectors.T @ (root * self.gradient)
-        return -root * (vectors @ (rotated / (values + damping)))
+        return -root * (vectors @ (rotated / (np.maximum(values, 1.0) + damping)))
 
     def step(self, limit: float) -> tuple[Floats, float]:
         """The best change of the coefficients that moves no observed node further than the limit, and how far it does.
@@ -238,7 +238,7 @@ class LocalModel:
         change, damping = self._whole, 0.0
         while (largest := self.largest_movement(change)) > 1.05 * limit or self.problem.is_too_far(change):
             self.is_undamped = False
-            damping = max(1.6 * damping, 1e-8 * self._eigen[0][-1], 0.1)
+            damping = max(1.6 * damping, 0.1)
             change = self._damped(damping)
         return change, largest
 

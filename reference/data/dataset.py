@@ -343,13 +343,19 @@ class DataSet:
 
     def _damage(self, block: int, stored: int) -> str:
         """What is wrong with a block, empty for nothing."""
-        size, group = self.header["block"], self._root["samples"]
+        size = self.header["block"]
         part = slice(block * size, (block + 1) * size)
         try:
-            arrays = {name: group[name][part] for name in schema.NAMES}
+            arrays = {name: array[part] for name, array in self._blocks.items()}
         except Exception as error:  # a damaged chunk fails in whichever codec reads it
             return f"is damaged ({type(error).__name__})"
         return "" if checksum(arrays) == stored else "does not match its checksum: truncated or changed"
+
+    @cached_property
+    def _blocks(self) -> dict[str, Any]:
+        """Arrays that blocks are parts of: to open each takes as long as to read a block of it."""
+        group = self._root["samples"]
+        return {name: group[name] for name in schema.NAMES}
 
     def _checksums(self) -> list[int]:
         """Of all blocks; one that cannot be read is 0, as of a block that is not there."""

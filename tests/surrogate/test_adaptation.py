@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ pytest.importorskip("torch", reason="torch is absent")
 from softtwin.meshes.io import read_body
 from softtwin.meshes.metrics import nodal_distances
 from softtwin.reference.data.dataset import DataSet
+from softtwin.reference.solve.problem import Problem
 from softtwin.surrogate.adaptation import OnlineLearner
 from softtwin.surrogate.calibration import calibrate
 from softtwin.surrogate.domain import with_domain
@@ -28,6 +31,8 @@ from softtwin.surrogate.twin import load, packed, save, unpacked
 
 pytestmark = pytest.mark.fenicsx
 BEYOND = 2.0  # times a load of the test split
+Pair = tuple[np.ndarray, np.ndarray]
+Way = Callable[..., list[Pair]]
 
 
 @pytest.fixture(scope="module")
@@ -52,23 +57,31 @@ def surrogate(request: pytest.FixtureRequest) -> Surrogate:
     return found
 
 
-def way(surrogate: Surrogate, data: DataSet, count: int = 30) -> list[tuple[np.ndarray, np.ndarray]]:
-    """A load that grows beyond the training and turns a little into another: loads and exact states."""
+@pytest.fixture(scope="module")
+def way(data: DataSet) -> Way:
+    """A load that grows beyond the training and turns a little into another: so many loads, their exact states."""
     a, b = (np.zeros_like(data.body.points) for _ in range(2))
     a[data.response.loaded], b[data.response.loaded] = data.samples("test").forces[:2]
-    exact, found = ExactStates(surrogate), []
-    for share in np.linspace(0.2, 1.0, count):
-        state = exact.frame(BEYOND * share * (a + 0.5 * share * b), None, surrogate)
-        found.append((state.load, state.displacement))
+
+    @cache
+    def found(count: int = 30) -> list[Pair]:
+        loads = [BEYOND * share * (a + 0.5 * share * b) for share in np.linspace(0.2, 1.0, count)]
+        states, state = [], None
+        with Problem(data.body, data.material) as problem:
+            for load in loads:
+                state = problem.solve(load, state, stability=False)
+                states.append(state.displacement)
+        return list(zip(loads, states, strict=True))
+
     return found
 
 
-def error(surrogate: Surrogate, pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
+def error(surrogate: Surrogate, pairs: list[Pair]) -> float:
     return float(np.mean([nodal_distances(surrogate.solve(f).displacement[None], u[None]).mean() for f, u in pairs]))
 
 
-def test_what_was_learned_helps_with_what_comes(surrogate: Surrogate, data: DataSet) -> None:
-    pairs = way(surrogate, data)
+def test_what_was_learned_helps_with_what_comes(surrogate: Surrogate, way: Way) -> None:
+    pairs = way()
     learner = OnlineLearner(surrogate, seconds=1.5)
     assert not learner.is_due
     for forces, state in pairs[:20]:
@@ -86,9 +99,9 @@ def test_what_was_learned_helps_with_what_comes(surrogate: Surrogate, data: Data
     json.dumps(packed(adapted)[1], allow_nan=False)
 
 
-def test_every_third_state_is_never_learned_from(network: Surrogate, data: DataSet) -> None:
+def test_every_third_state_is_never_learned_from(network: Surrogate, way: Way) -> None:
     learner = OnlineLearner(network)
-    pairs = way(network, data, 12)
+    pairs = way(12)
     kept = [learner.observe(*pair).is_kept_back for pair in pairs]
     assert kept == [False, False, True] * 4
     new = learner._exact.samples(learner._known, 1.0)
@@ -96,20 +109,20 @@ def test_every_third_state_is_never_learned_from(network: Surrogate, data: DataS
         assert is_kept_back != any(np.array_equal(each, state.ravel()) for each in new.displacements)
 
 
-def test_what_does_no_better_is_not_taken(network: Surrogate, data: DataSet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_does_no_better_is_not_taken(network: Surrogate, way: Way, monkeypatch: pytest.MonkeyPatch) -> None:
     learner = OnlineLearner(network)
-    for pair in way(network, data, 12):
+    for pair in way(12):
         learner.observe(*pair)
     monkeypatch.setattr(learner._kind, "adapted", lambda maps, same, new: (maps, same))
     assert learner.adapt() is None and learner.current.network is network.network
     assert not learner.is_due and learner.adaptations == 0
 
 
-def test_bounds_follow_what_the_tests_say(network: Surrogate, data: DataSet) -> None:
+def test_bounds_follow_what_the_tests_say(network: Surrogate, way: Way) -> None:
     """A miss raises them at once by what they missed by and by as much as nine hits lower them: nine in ten hold."""
     learner = OnlineLearner(network)
     missed, widths = [], []
-    for forces, state in way(network, data, 40):
+    for forces, state in way(40):
         seen = learner.observe(forces, state)
         missed.append(max(0.0, float(np.log(seen.error["mean"] / seen.bound["mean"]))))
         widths.append(learner.current.card["certificate"]["quantiles"]["mean"][0])
@@ -119,10 +132,10 @@ def test_bounds_follow_what_the_tests_say(network: Surrogate, data: DataSet) -> 
     assert 0.8 <= np.mean(misses[9:] == 0.0) <= 1.0
 
 
-def test_states_ahead_lie_where_the_loads_go(network: Surrogate, data: DataSet) -> None:
+def test_states_ahead_lie_where_the_loads_go(network: Surrogate, way: Way) -> None:
     exact = ExactStates(network)
     assert not exact.explore(network)  # nothing has come yet
-    for forces, state in way(network, data, 10):
+    for forces, state in way(10):
         exact.keep(exact.frame(forces, state, network))
     assert all(exact.explore(network) for _ in range(4))
     size = max(np.linalg.norm(each.displacement) for each in exact.frames.learned)
@@ -131,9 +144,9 @@ def test_states_ahead_lie_where_the_loads_go(network: Surrogate, data: DataSet) 
         assert np.abs(each.displacement[network.body.fixed]).max() == 0.0
 
 
-def test_changes_are_those_of_the_exact_state(network: Surrogate, data: DataSet) -> None:
+def test_changes_are_those_of_the_exact_state(network: Surrogate, way: Way) -> None:
     exact = ExactStates(network)
-    for forces, state in way(network, data, 6):
+    for forces, state in way(6):
         exact.keep(exact.frame(forces, state, network))
     state = exact.frames.learned[-1]
     for push, change in list(zip(state.pushes, state.changes, strict=True))[:3]:
@@ -160,10 +173,10 @@ def test_a_frame_at_rest_teaches_nothing_and_breaks_nothing(network: Surrogate) 
         (lambda f, u: (-f, u), r"times the load out of balance"),
     ],
 )
-def test_what_is_no_state_of_this_organ_is_refused(network: Surrogate, data: DataSet, change: Any, said: str) -> None:
+def test_what_is_no_state_of_this_organ_is_refused(network: Surrogate, way: Way, change: Any, said: str) -> None:
     learner = OnlineLearner(network)
     with pytest.raises(ValueError, match=said):
-        learner.observe(*change(*way(network, data, 1)[0]))
+        learner.observe(*change(*way(1)[0]))
     assert learner.frames == 0 and not list(learner._exact)
 
 
@@ -177,10 +190,10 @@ def test_others_are_refused_before_anything_is_solved(network: Surrogate, data: 
 # ---------------------------------------------------------------------- on its way, and on a full disk
 
 
-def test_what_is_packed_comes_back(surrogate: Surrogate, data: DataSet) -> None:
+def test_what_is_packed_comes_back(surrogate: Surrogate, way: Way) -> None:
     weights, card = packed(surrogate)
     other = unpacked(weights, card, surrogate.body)
-    forces = way(surrogate, data, 1)[0][0]
+    forces = way(1)[0][0]
     assert np.array_equal(other.solve(forces).displacement, surrogate.solve(forces).displacement)
     assert other.card["certificate"] == surrogate.card["certificate"]
 
