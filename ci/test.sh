@@ -126,7 +126,7 @@ tests() {
 }
 # marked NAME: the files with such tests. Only these are imported: all of them take a quarter of a minute.
 marked() { grep -rl --include='*.py' "mark\.$1\b" tests; }
-# One after the other: each starts ranks for both cores, or a browser that draws on one of them.
+# One after the other: each starts ranks for both cores, or a browser.
 ranks() { run_tests ranks -m "mpi and not slow" $(marked mpi); }
 browser() { run_tests browser -m "browser and not slow" $(marked browser); }
 contract() { bash ci/no-fenicsx.sh contract "$LOGS/contract.xml"; }
@@ -140,7 +140,7 @@ group docs docs
 if [ -f build/site/index.html ] && grep -qs ^passed "$LOGS/docs.outcome"; then
     export SOFTTWIN_SITE="$ROOT/build/site" # the tests of the site read this one
 fi
-lane types contract # they wait for the disk and for one another, and fill what the tests leave of two cores
+lane types contract browser # they wait for the disk, a page or one another, and fill what the tests leave of two cores
 group tests tests
 join
 if [ ! -d ../shared/data/liver ]; then
@@ -150,9 +150,7 @@ if [ ! -d ../shared/data/liver ]; then
 elif [ ${#ASKED[@]} != 0 ]; then # else among the tests
     group liver run_tests liver "${parallel[@]}" -m "liver and not slow" tests
 fi
-lane ranks # a browser leaves a core idle, and whoever starts programs waits for them
-group browser browser
-join
+group ranks ranks
 if [ $ALL = 1 ] || [ ${#ASKED[@]} != 0 ]; then
     group slow slow
     group slow-apart slow_apart

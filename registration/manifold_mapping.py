@@ -43,18 +43,18 @@ class ManifoldMapping:
         offset = exact.full.displacement - own.full.displacement
         return cls(fast, nodes, expansion_point, offset, exact.jacobian(every) - own.jacobian(every))
 
-    def onward(self, coefficients: Floats, exact: ReducedState, most: float) -> ManifoldMapping:
+    def onward(self, coefficients: Floats, exact: ReducedState, tolerance: float) -> ManifoldMapping:
         """Moved to another exact state, whose slopes are these, mended by what both states tell (Broyden 1965).
 
         Args:
             coefficients: of it, (k,).
             exact: it, seen at the same nodes.
-            most: where these slopes missed more than this part of what lies between both states, its own are taken.
+            tolerance: where these slopes missed more than this part of what lies between both states, its own are taken.
         """
         guess, way = self.solve(coefficients), coefficients - self.expansion_point
         missed = (exact.positions - guess.positions).ravel()
         moved = (exact.positions - self.solve(self.expansion_point).positions).ravel()
-        if np.linalg.norm(missed) > most * np.linalg.norm(moved):
+        if np.linalg.norm(missed) > tolerance * np.linalg.norm(moved):
             return self.at(self.fast, self.nodes, coefficients, exact)
         offset = exact.full.displacement - guess.own.full.displacement
         slopes = self.slopes + np.outer(missed, way) / max(float(way @ way), 1e-300)

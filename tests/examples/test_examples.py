@@ -84,8 +84,9 @@ def test_design_a_phantom(tmp_path: Path, capsys) -> None:
     assert (tmp_path / "design.png").stat().st_size > 10_000
     assert "found with" in capsys.readouterr().out
     phantom = design_a_phantom.Phantom()
-    slope = phantom.slope(phantom.state(tumour), tumour)
-    ends = [phantom.strain(phantom.state(tumour * float(np.exp(step))).displacement) for step in (1e-3, -1e-3)]
+    there = phantom.state(tumour)
+    slope = phantom.slope(there, tumour)
+    ends = [phantom.strain(phantom.state(tumour * float(np.exp(step)), there).displacement) for step in (1e-3, -1e-3)]
     assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-3)
 
 

@@ -100,7 +100,7 @@ def test_moved_on_it_is_exact_at_both_states(onward) -> None:
     moved, exact, before, place = onward
     there = exact.solve(place)
     missed = np.abs(moved.solve(place).positions - there.positions).max()
-    again = moved.onward(place, there, most=np.inf)
+    again = moved.onward(place, there, tolerance=np.inf)
     assert missed > 1e-6
     np.testing.assert_allclose(again.solve(place).positions, there.positions, atol=1e-14)
     np.testing.assert_allclose(again.solve(place).full.displacement, there.full.displacement, atol=1e-14)
@@ -113,7 +113,7 @@ def test_moved_on_it_is_exact_at_both_states(onward) -> None:
 def test_where_its_slopes_have_missed_by_much_it_takes_those_of_the_state(onward) -> None:
     moved, exact, _, place = onward
     there, every = exact.solve(place), csr_array(eye(3 * len(moved.nodes)))
-    again = moved.onward(place, there, most=0.0)
+    again = moved.onward(place, there, tolerance=0.0)
     np.testing.assert_allclose(again.solve(place).jacobian(every), there.jacobian(every), atol=1e-14)
 
 
