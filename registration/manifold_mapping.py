@@ -49,7 +49,7 @@ class ManifoldMapping:
         Args:
             coefficients: of it, (k,).
             exact: it, seen at the same nodes.
-            tolerance: where these slopes missed more than this part of what lies between both states, its own are taken.
+            tolerance: where these slopes missed a larger part of what lies between both states, its own are taken.
         """
         guess, way = self.solve(coefficients), coefficients - self.expansion_point
         missed = (exact.positions - guess.positions).ravel()
