@@ -120,6 +120,8 @@ class GaussNewton:
             whether a step was the last is seen by the derivatives before it, where it kept what they promised.
         is_shared: neighbours are known to share noise: it is sought from the first step on. Else forces would explain
             it first, as far as they can.
+        before: length of the way to the start, in posterior deviations a coefficient, where it led to where it should:
+            how much shorter the next is tells what is left. Not known if not given.
         until: no step is begun after this time of the monotonic clock, seconds.
         before_step: called before each; it may wait.
     """
@@ -134,6 +136,7 @@ class GaussNewton:
     minimum_step: float = 1e-6
     is_near: bool = False
     is_shared: bool = False
+    before: float = np.inf
     until: float = np.inf
     before_step: Callable[[], None] | None = None
 
@@ -365,11 +368,12 @@ class _Search:
             length: of the next.
         """
         known = self.trace[self.comparable :]
-        if not known or abs(known[-1].gain - 1.0) >= ACCURACY.kept or not self.takes_last:
+        if known and abs(known[-1].gain - 1.0) >= ACCURACY.kept:
             return length
-        if length >= self.options.handed_on:
+        before = known[-1].length if known else self.options.before if not self.comparable else np.inf
+        if before == np.inf or not self.takes_last or length >= self.options.handed_on:
             return length
-        rate = min(length / known[-1].length, ACCURACY.slowest)
+        rate = min(length / before, ACCURACY.slowest)
         return length * rate / (1.0 - rate)
 
     def _step(self, local: LocalModel, loss: Loss) -> Outcome | None:

@@ -210,6 +210,12 @@ class LocalModel:
         """Length of the whole step in posterior deviations a coefficient."""
         return _length(self._whole, self.gradient)
 
+    def length_of(self, change: Floats) -> float:
+        """Length of any change of the coefficients, (k,), in the same measure."""
+        gained = change * np.sqrt(self.precision)
+        square = gained @ self.evidence.scaled(self.eta) @ gained if self._law is None else self._law.square(change)
+        return float(np.sqrt(square / len(change)))
+
     def moved_to(self, evaluation: Evaluation) -> LocalModel:
         """The same about a trial so near that derivatives, hyperparameters and what the points tell are the same."""
         other = copy.copy(self)

@@ -28,6 +28,7 @@ class ManifoldMapping:
         expansion_point: coefficients there, (k,).
         offset: what is added to all displacements, (n, 3), metres.
         slopes: what is added to the derivatives of the chosen ones, (3p, k).
+        is_mended: the slopes are those of a state before, mended: see `onward`.
     """
 
     fast: ReducedModel
@@ -35,6 +36,7 @@ class ManifoldMapping:
     expansion_point: Floats
     offset: Floats
     slopes: Floats
+    is_mended: bool = False
 
     @classmethod
     def at(cls, fast: ReducedModel, nodes: Ints, expansion_point: Floats, exact: ReducedState) -> ManifoldMapping:
@@ -58,7 +60,7 @@ class ManifoldMapping:
             return self.at(self.fast, self.nodes, coefficients, exact)
         offset = exact.full.displacement - guess.own.full.displacement
         slopes = self.slopes + np.outer(missed, way) / max(float(way @ way), 1e-300)
-        return ManifoldMapping(self.fast, self.nodes, coefficients, offset, slopes)
+        return ManifoldMapping(self.fast, self.nodes, coefficients, offset, slopes, True)
 
     @property
     def count(self) -> int:

@@ -58,6 +58,7 @@ def approached(
         eta = way.local.eta
         if not way.trace or setup.is_late:
             break
+        length = way.local.length_of(way.evaluation.coefficients - way.local.problem.sized(near.coefficients))
         try:
             exact = problem if way.local.problem.shared is not None else problem.unshared
             near = exact.evaluation(way.evaluation.coefficients, replace(way.evaluation, state=near.state))
@@ -65,6 +66,7 @@ def approached(
             break
         spent.append(replace(way, evaluations=1))  # states of the exact model alone are counted
         mapping = mapping.onward(near.coefficients[problem.force_part], near.state, ACCURACY.kept)
+        solver = replace(solver, before=length if mapping.is_mended else np.inf)
     if near.given is not problem.cloud:
         near = problem.evaluation(near.coefficients.copy(), near)
     if mapping is not None:
