@@ -205,7 +205,9 @@ class Accuracy:
     first_step: float = choice(0.05, "sizes of the body", "first limit on the movement of a node in one step")
     iterations: int = count(40, "", "most iterations of Gauss-Newton")
     few_iterations: int = count(8, "", "most for a start, and before noise that neighbours share is thought of")
-    kept: float = choice(0.2, "of what a step promised", "derivatives are kept after a step that missed it by less")
+    kept: float = choice(
+        0.2, "of what a step promised", "derivatives are kept, or mended, after a step that missed it by less"
+    )
     summed: float = choice(0.02, "of all weights", "points are summed anew where weights have changed by more")
     groups: int = count(6, "", "groups of points by how far the model's error makes them doubtful")
     lengths: int = count(5, "", "lengths of shared noise that are looked at")
@@ -239,7 +241,7 @@ class Accuracy:
         "directions of force that a cold start begins with",
         "guards: robustness, surrogate, no zone, noise 1 mm: with six the wrong of two states of one sequence",
     )
-    expansion_points: int = count(3, "", "exact states from which a fast model goes on")
+    expansion_points: int = count(3, "", "exact states from which a fast model, or the tangent of one, goes on")
     far: float = choice(
         3.0, "times its noise", "so far from the last frame, a cloud may lie nearer to the body at rest"
     )
