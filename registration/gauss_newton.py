@@ -120,8 +120,8 @@ class GaussNewton:
             whether a step was the last is seen by the derivatives before it, where it kept what they promised.
         is_shared: neighbours are known to share noise: it is sought from the first step on. Else forces would explain
             it first, as far as they can.
-        before: length of the way to the start, in posterior deviations a coefficient, where it led to where it should:
-            how much shorter the next is tells what is left. Not known if not given.
+        length_before: length of the step that led to the start, in posterior deviations a coefficient, where it kept
+            what it promised: by it the rate of convergence is known at the first step. Infinite if not known.
         until: no step is begun after this time of the monotonic clock, seconds.
         before_step: called before each; it may wait.
     """
@@ -136,7 +136,7 @@ class GaussNewton:
     minimum_step: float = 1e-6
     is_near: bool = False
     is_shared: bool = False
-    before: float = np.inf
+    length_before: float = np.inf
     until: float = np.inf
     before_step: Callable[[], None] | None = None
 
@@ -370,7 +370,7 @@ class _Search:
         known = self.trace[self.comparable :]
         if known and abs(known[-1].gain - 1.0) >= ACCURACY.kept:
             return length
-        before = known[-1].length if known else self.options.before if not self.comparable else np.inf
+        before = known[-1].length if known else self.options.length_before if not self.comparable else np.inf
         if before == np.inf or not self.takes_last or length >= self.options.handed_on:
             return length
         rate = min(length / before, ACCURACY.slowest)

@@ -28,7 +28,7 @@ class ManifoldMapping:
         expansion_point: coefficients there, (k,).
         offset: what is added to all displacements, (n, 3), metres.
         slopes: what is added to the derivatives of the chosen ones, (3p, k).
-        is_mended: the slopes are those of a state before, mended: see `onward`.
+        has_secant: the slopes are those of an earlier state with Broyden's update, not the exact ones: see `updated`.
     """
 
     fast: ReducedModel
@@ -36,7 +36,7 @@ class ManifoldMapping:
     expansion_point: Floats
     offset: Floats
     slopes: Floats
-    is_mended: bool = False
+    has_secant: bool = False
 
     @classmethod
     def at(cls, fast: ReducedModel, nodes: Ints, expansion_point: Floats, exact: ReducedState) -> ManifoldMapping:
@@ -45,8 +45,8 @@ class ManifoldMapping:
         offset = exact.full.displacement - own.full.displacement
         return cls(fast, nodes, expansion_point, offset, exact.jacobian(every) - own.jacobian(every))
 
-    def onward(self, coefficients: Floats, exact: ReducedState, tolerance: float) -> ManifoldMapping:
-        """Moved to another exact state, whose slopes are these, mended by what both states tell (Broyden 1965).
+    def updated(self, coefficients: Floats, exact: ReducedState, tolerance: float) -> ManifoldMapping:
+        """The same at another exact state, with Broyden's update of the slopes: their secant is exact (1965).
 
         Args:
             coefficients: of it, (k,).
@@ -116,8 +116,8 @@ class ManifoldMappingState:
 
 
 @dataclass(frozen=True, eq=False)
-class MendedState:
-    """An exact reduced state with the slopes that a mapping has there: no derivative is made anew at the chosen nodes.
+class SecantState:
+    """An exact reduced state whose derivatives at the chosen nodes are the mapping's: none is computed.
 
     Args:
         exact: the state.
@@ -147,7 +147,7 @@ class MendedState:
 
 
 @dataclass(frozen=True, eq=False)
-class Still:
+class ZeroModel:
     """A reduced model of a body that nothing moves: mapped to an exact state, it is the tangent there.
 
     Args:
@@ -160,24 +160,24 @@ class Still:
     chosen: int
     nodes: int
 
-    def combined(self, matrix: Floats) -> Still:
+    def combined(self, matrix: Floats) -> ZeroModel:
         """The same for other combinations of the forces."""
-        return Still(matrix.shape[1], self.chosen, self.nodes)
+        return ZeroModel(matrix.shape[1], self.chosen, self.nodes)
 
-    def solve(self, coefficients: Floats, near: Any = None) -> StillState:
+    def solve(self, coefficients: Floats, near: Any = None) -> ZeroState:
         """At rest."""
-        return StillState(self)
+        return ZeroState(self)
 
 
 @dataclass(frozen=True, eq=False)
-class StillState:
+class ZeroState:
     """Rest, whatever acts.
 
     Args:
         model: of which.
     """
 
-    model: Still
+    model: ZeroModel
 
     @property
     def positions(self) -> Floats:
@@ -185,9 +185,9 @@ class StillState:
         return np.zeros((self.model.chosen, 3))
 
     @property
-    def full(self) -> StillBody:
+    def full(self) -> ZeroDisplacement:
         """The whole body."""
-        return StillBody(self.model.nodes)
+        return ZeroDisplacement(self.model.nodes)
 
     def jacobian(self, rows: csr_array) -> Floats:
         """Zeros, (q, k)."""
@@ -199,7 +199,7 @@ class StillState:
 
 
 @dataclass(frozen=True)
-class StillBody:
+class ZeroDisplacement:
     """A whole body at rest.
 
     Args:

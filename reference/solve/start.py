@@ -127,10 +127,10 @@ class Starts:
         solved = tangent.solve_as_it_is(load, gap[None])  # it may be near enough, and saves a factorisation
         if solved is not None:
             step = -solved[0]
-            if self._keeps(start, step, gap, at, load)[0] and self._shrinks(start + step, gap, load):
+            if self._descends(start, step, gap, at, load)[0] and self._reduces_residual(start + step, gap, load):
                 return Start(start + step, "guess", may_leave=False, has_tangent=True), True
         step = -tangent.solve(*self._system.point(guess), gap[None])[0]
-        is_kept, ahead = self._keeps(start, step, gap, at, load)
+        is_kept, ahead = self._descends(start, step, gap, at, load)
         if is_kept:
             return Start(start + step, "guess", may_leave=False, has_tangent=True), True
         turned = self._turned(guess, path)
@@ -138,7 +138,9 @@ class Starts:
             return Start(turned, "guess", may_leave=False), True
         return Start(start + step if ahead < at else start, "guess"), False
 
-    def _keeps(self, start: Floats, step: Floats, gap: Floats, merit: float, load: DiscreteLoad) -> tuple[bool, float]:
+    def _descends(
+        self, start: Floats, step: Floats, gap: Floats, merit: float, load: DiscreteLoad
+    ) -> tuple[bool, float]:
         """Whether a step leads as far down as its tangent promises, and the merit where it leads.
 
         Args:
@@ -152,7 +154,7 @@ class Starts:
         promised = merit if self._space.mixed else -0.5 * self._space.dot(gap, step)
         return bool(0.0 <= _TRUSTED * promised <= merit - ahead), ahead
 
-    def _shrinks(self, unknowns: Floats, gap: Floats, load: DiscreteLoad) -> bool:
+    def _reduces_residual(self, unknowns: Floats, gap: Floats, load: DiscreteLoad) -> bool:
         """Whether less is left of a residual: further steps with the same tangent go on from there."""
         left = self._forms.residual(unknowns, load)
         left[self._space.fixed] = 0.0

@@ -8,8 +8,8 @@ from ..cloud import Cloud
 from ..forward import ForwardModel
 from ..result import Registration
 from ..setup import Ended, Setup
-from .approach import approached
 from .cold_start import Localised, finish
+from .multifidelity import solved_with
 
 
 def refine(
@@ -30,7 +30,7 @@ def refine(
     if last is not None and is_same_place and last.prepared is not draft.prepared:  # else it is the draft itself
         problem = setup.problem(points, last.prepared, last.evaluation.positions, last.rms_distance)
         near = replace(last.evaluation, coefficients=problem.carried(last.evaluation.coefficients, last.problem))
-        return Ended(last.prepared, approached(setup, problem, near, solver, last.eta))
+        return Ended(last.prepared, solved_with(setup, problem, near, solver, last.eta))
     # Told a zone, the exact model gathers no forces within it, and takes none that were: see `options_for`.
     prepared = setup.unlocalised
     if setup.options.localisation.rounds:
@@ -38,5 +38,5 @@ def refine(
     problem = setup.plain(points, prepared)
     start = problem.carried(draft.coefficients, draft.problem)
     start[problem.force_part] = prepared.forces.nearest(draft.unknown_forces)
-    found = approached(setup, problem, problem.evaluation(start, draft.evaluation), solver, draft.eta, fast)
+    found = solved_with(setup, problem, problem.evaluation(start, draft.evaluation), solver, draft.eta, fast)
     return finish(setup, points, Localised(prepared, found))

@@ -12,8 +12,8 @@ from ..policy import ACCURACY, POLICY
 from ..problem import Problem
 from ..result import Registration
 from ..setup import Ended, Setup
-from .approach import approached
 from .cold_start import Localised, begin, finish
+from .multifidelity import solved_with
 
 
 def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
@@ -34,7 +34,7 @@ def track(setup: Setup, points: Cloud, last: Registration) -> Ended:
     if _is_as_expected(setup, problem, near, last):
         solver = solver.directly()
     if setup.is_exact:  # each state of it is dear
-        return Ended(prepared, approached(setup, problem, near, solver, last.eta))
+        return Ended(prepared, solved_with(setup, problem, near, solver, last.eta))
     return Ended(prepared, solver.solve(problem, near.coefficients, near, last.eta))
 
 

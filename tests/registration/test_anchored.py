@@ -9,7 +9,7 @@ from scipy.sparse import csr_array, eye
 from softtwin.meshes.body import Body
 from softtwin.registration.forward import reduce_model
 from softtwin.registration.hyperparameters import LogNormalPrior
-from softtwin.registration.manifold_mapping import ManifoldMapping, MendedState, Still
+from softtwin.registration.manifold_mapping import ManifoldMapping, SecantState, ZeroModel
 from softtwin.registration.parameters.nodal_forces import nodal_forces
 
 from .conftest import Cantilever, tip_forces
@@ -72,18 +72,18 @@ def test_combined_directions_are_the_same_model(anchored, rng) -> None:
 
 
 @pytest.fixture(params=["fast", "tangent"])
-def onward(request: pytest.FixtureRequest, anchored) -> tuple[ManifoldMapping, object, np.ndarray, np.ndarray]:
+def updatable(request: pytest.FixtureRequest, anchored) -> tuple[ManifoldMapping, object, np.ndarray, np.ndarray]:
     """The moved model, or the exact one's tangent, the exact one, where that is anchored, and a place nearby."""
     moved, exact, expansion_point = anchored
     if request.param == "tangent":
         there = exact.solve(expansion_point)
-        still = Still(moved.count, len(moved.nodes), len(there.full.displacement))
-        moved = ManifoldMapping.at(still, moved.nodes, expansion_point, there)
+        zero = ZeroModel(moved.count, len(moved.nodes), len(there.full.displacement))
+        moved = ManifoldMapping.at(zero, moved.nodes, expansion_point, there)
     return moved, exact, expansion_point, 1.2 * expansion_point
 
 
-def test_the_tangent_is_the_exact_models(onward, rng) -> None:
-    moved, exact, expansion_point, place = onward
+def test_the_tangent_is_the_exact_models(updatable, rng) -> None:
+    moved, exact, expansion_point, place = updatable
     there, every = exact.solve(expansion_point), csr_array(eye(3 * len(moved.nodes)))
     np.testing.assert_allclose(moved.solve(expansion_point).jacobian(every), there.jacobian(every), atol=1e-14)
     np.testing.assert_allclose(moved.solve(expansion_point).positions, there.positions, atol=1e-14)
@@ -95,12 +95,12 @@ def test_the_tangent_is_the_exact_models(onward, rng) -> None:
     np.testing.assert_allclose(turned.moved(turn.T @ change, 3), at.moved(change, 3), atol=1e-12)
 
 
-def test_moved_on_it_is_exact_at_both_states(onward) -> None:
+def test_moved_on_it_is_exact_at_both_states(updatable) -> None:
     """The secant between them is what the exact model did, and what is across it stays."""
-    moved, exact, before, place = onward
+    moved, exact, before, place = updatable
     there = exact.solve(place)
     missed = np.abs(moved.solve(place).positions - there.positions).max()
-    again = moved.onward(place, there, tolerance=np.inf)
+    again = moved.updated(place, there, tolerance=np.inf)
     assert missed > 1e-6
     np.testing.assert_allclose(again.solve(place).positions, there.positions, atol=1e-14)
     np.testing.assert_allclose(again.solve(place).full.displacement, there.full.displacement, atol=1e-14)
@@ -110,21 +110,21 @@ def test_moved_on_it_is_exact_at_both_states(onward) -> None:
     np.testing.assert_allclose((again.slopes - moved.slopes) @ across, 0.0, atol=1e-14)
 
 
-def test_where_its_slopes_have_missed_by_much_it_takes_those_of_the_state(onward) -> None:
-    moved, exact, _, place = onward
+def test_where_its_slopes_have_missed_by_much_it_takes_those_of_the_state(updatable) -> None:
+    moved, exact, _, place = updatable
     there, every = exact.solve(place), csr_array(eye(3 * len(moved.nodes)))
-    again = moved.onward(place, there, tolerance=0.0)
+    again = moved.updated(place, there, tolerance=0.0)
     np.testing.assert_allclose(again.solve(place).jacobian(every), there.jacobian(every), atol=1e-14)
 
 
-def test_a_mended_state_is_the_exact_one_with_the_mapped_slopes(onward) -> None:
-    moved, exact, expansion_point, place = onward
+def test_a_secant_state_is_the_exact_one_with_the_mapped_slopes(updatable) -> None:
+    moved, exact, expansion_point, place = updatable
     there, every = exact.solve(place), csr_array(eye(3 * len(moved.nodes)))
-    mended = MendedState(there, moved.solve(expansion_point))
-    np.testing.assert_array_equal(mended.positions, there.positions)
-    assert mended.full is there.full
-    np.testing.assert_array_equal(mended.jacobian(every), moved.solve(expansion_point).jacobian(every))
+    secant = SecantState(there, moved.solve(expansion_point))
+    np.testing.assert_array_equal(secant.positions, there.positions)
+    assert secant.full is there.full
+    np.testing.assert_array_equal(secant.jacobian(every), moved.solve(expansion_point).jacobian(every))
     change = np.ones(moved.count)
     np.testing.assert_allclose(
-        mended.moved(change, 2).ravel(), (mended.jacobian(every) @ change).reshape(-1, 3)[::2].ravel()
+        secant.moved(change, 2).ravel(), (secant.jacobian(every) @ change).reshape(-1, 3)[::2].ravel()
     )

@@ -125,7 +125,7 @@ def test_the_way_to_the_start_tells_what_is_left(body: Body, rng: np.random.Gene
     start = last.evaluation.coefficients + 0.3 * change / last.solved.local.length_of(change)
     problem = made.setup.plain(made.setup.checked(cloud), last.prepared)
     alone, known = (
-        GaussNewton(is_near=True, before=length).directly().solve(problem, start, None, last.eta)
+        GaussNewton(is_near=True, length_before=length).directly().solve(problem, start, None, last.eta)
         for length in (np.inf, 30.0)
     )
     assert 0.15 < alone.trace[0].length < 0.4

@@ -1,4 +1,4 @@
-"""An exact model's minimum, most of the way to which a cheaper one knows from any state of it (`ManifoldMapping`)."""
+"""An exact model's minimum with the help of a cheaper one that is corrected at each exact state (`ManifoldMapping`)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..evaluation import Evaluation
 from ..forward import ForwardModel, ReducedModel
 from ..gauss_newton import GaussNewton, SolverResult
 from ..lbfgs import LBFGS
-from ..manifold_mapping import ManifoldMapping, MendedState, Still
+from ..manifold_mapping import ManifoldMapping, SecantState, ZeroModel
 from ..policy import ACCURACY
 from ..problem import Problem
 from ..setup import Setup, after
@@ -22,7 +22,7 @@ from ..setup import Setup, after
 Floats = NDArray[np.float64]
 
 
-def approached(
+def solved_with(
     setup: Setup,
     problem: Problem,
     near: Evaluation,
@@ -32,10 +32,10 @@ def approached(
 ) -> SolverResult:
     """Where the solver ends from a trial of the exact model.
 
-    The cheaper model is a fast one, or the exact one's tangent: with it points are matched, weighed and their noise is
-    found as often as it takes, for the price of one state and its slopes. Each exact state where it ends mends it.
-    A cheaper model takes no unknown inputs: with them, and where the exact one finds no state, the way is the latter's,
-    as it is of L-BFGS, which wants the whole body's slopes.
+    The solver minimises with a cheaper model: a fast one, or the exact one's tangent. The exact model then solves for
+    one state at that minimum, by which the cheaper one is corrected, and so on; derivatives are made once. The exact
+    model is minimised alone with unknown inputs, which a cheaper model does not take, with L-BFGS, which needs the
+    whole body's gradient, and from where it has found no state.
 
     Args:
         setup: what is registered.
@@ -65,14 +65,14 @@ def approached(
         except NotConverged:
             break
         spent.append(replace(way, evaluations=1))  # states of the exact model alone are counted
-        mapping = mapping.onward(near.coefficients[problem.force_part], near.state, ACCURACY.kept)
-        solver = replace(solver, before=length if mapping.is_mended else np.inf)
+        mapping = mapping.updated(near.coefficients[problem.force_part], near.state, ACCURACY.kept)
+        solver = replace(solver, length_before=length if mapping.has_secant else np.inf)
     if near.given is not problem.cloud:
         near = problem.evaluation(near.coefficients.copy(), near)
     if mapping is not None:
-        near = replace(near, state=MendedState(near.state, mapping.solve(mapping.expansion_point)))
+        near = replace(near, state=SecantState(near.state, mapping.solve(mapping.expansion_point)))
     found = solver.solve(problem, near.coefficients, near, eta)
-    if isinstance(found.evaluation.state, MendedState):
+    if isinstance(found.evaluation.state, SecantState):
         found = replace(found, evaluation=replace(found.evaluation, state=found.evaluation.state.exact))
     return reduce(after, [*spent, found])
 
@@ -81,4 +81,4 @@ def _cheaper(setup: Setup, problem: Problem, fast: ForwardModel | None) -> Reduc
     """The fast model between the same forces and nodes, or none that moves."""
     if fast is not None:
         return setup.reduced(fast, problem.forces)
-    return Still(problem.forces.size, len(setup.observed.nodes), len(setup.model.body.points))
+    return ZeroModel(problem.forces.size, len(setup.observed.nodes), len(setup.model.body.points))
