@@ -225,6 +225,22 @@ class Evidence:
         """At logarithms of the hyperparameters, (h,), with the gradient, (h,)."""
         return self._at(eta)[:2]
 
+    def alone(self, eta: Floats) -> float:
+        """The same without its gradient; infinity where information and prior are too far apart."""
+        law = self.conditional(eta)
+        return np.inf if law is None else self._value(eta, law, self.noise(eta)[0])[0]
+
+    def _value(self, eta: Floats, law: Conditional, noise: Floats) -> tuple[float, Floats]:
+        """With the gradient of what is believed, (h,)."""
+        problem, precision = self.problem, np.exp(-noise)
+        projection = precision @ problem.projection
+        if problem.known is not None:
+            projection += problem.known[1]
+        believed, gradient = self.hyperprior.cost(eta)
+        square = float(precision @ (problem.square + problem.tail)) - float((law.root * law.mean) @ projection)
+        half = float(np.log(np.diag(law.factor)).sum())
+        return 0.5 * (float(problem.count @ noise) + square) + half + believed, gradient
+
     def _at(self, eta: Floats) -> tuple[float, Floats, Floats]:
         """The same with about the second derivative by each: that expected of right hyperparameters, (h,)."""
         problem = self.problem
@@ -233,13 +249,7 @@ class Evidence:
         if law is None:
             return np.inf, np.zeros_like(eta), np.ones_like(eta)
         precision, moved = np.exp(-noise), law.root * law.mean
-        half = float(np.log(np.diag(law.factor)).sum())
-        projection = precision @ problem.projection
-        if problem.known is not None:
-            projection += problem.known[1]
-        believed, gradient = self.hyperprior.cost(eta)
-        square = float(precision @ (problem.square + problem.tail))
-        value = 0.5 * float(problem.count @ noise) + half + 0.5 * (square - float(moved @ projection)) + believed
+        value, gradient = self._value(eta, law, noise)
         told = 1.0 - np.diag(law.lower)
         gradient = gradient + 0.5 * slopes @ (told - law.mean**2)
         bend = self.hyperprior.bend + 0.5 * (slopes**2 @ told**2 + by_noise**2 @ problem.count)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .hyperparameters import DISCREPANCY, NOISE
+from .hyperparameters import DISCREPANCY, FORCE, NOISE, QUADRATURE
 from .local_model import LocalModel
 from .posterior import Posterior
 
@@ -13,15 +13,16 @@ Floats = NDArray[np.float64]
 
 
 def posterior(local: LocalModel) -> Posterior:
-    """The normal law at a trial, with what the doubt of the hyperparameters moves.
+    """The normal law at a trial, with what the doubt of the hyperparameters moves and widens.
 
     Args:
         local: the objective's model there.
     """
     informed = float(local.informed[local.problem.moving].sum())
     moved, spread = _by_hyperparameters(local)
-    covariance = error_covariance(local) + moved @ spread @ moved.T
-    return Posterior(local.evaluation.coefficients, covariance, local.scales, informed)
+    widened, force = _by_force_scale(local, spread)
+    covariance = error_covariance(local) + moved @ spread @ moved.T + widened
+    return Posterior(local.evaluation.coefficients, covariance, local.scales, informed, force)
 
 
 def error_covariance(local: LocalModel) -> Floats:
@@ -53,3 +54,32 @@ def _by_hyperparameters(local: LocalModel) -> tuple[Floats, Floats]:
     columns[:, NOISE] = 2.0 * (share * weighted) @ local.jacobian
     columns[:, DISCREPANCY] += 2.0 * ((1.0 - share) * weighted) @ local.jacobian
     return local.inverse @ columns, local.evidence.covariance(local.eta)
+
+
+def _by_force_scale(local: LocalModel, spread: Floats) -> tuple[Floats | float, float]:
+    """What the doubt of the forces' scale adds to the covariance, (k, k), and the root of its mean square, newtons.
+
+    Of directions that the cloud does not tell the variance is the square of the scale, and few directions that it tells
+    leave the scale in doubt. The unknowns' covariance is therefore its mean over the scale (integrated nested Laplace
+    approximations: Rue, Martino and Chopin 2009, 3.2), by Gauss's and Hermite's quadrature with the evidence itself as
+    the density; the other hyperparameters follow along their regression.
+
+    Args:
+        local: the objective's model at the end.
+        spread: covariance of the logarithms of the hyperparameters, (h, h).
+    """
+    deviation, evidence = np.sqrt(spread[FORCE, FORCE]), local.evidence
+    law = evidence.conditional(local.eta)
+    if deviation == 0.0 or law is None:
+        return 0.0, local.scales.force
+    line, least, middle = spread[:, FORCE] / deviation, evidence.alone(local.eta), law.covariance
+    covariance, square, total = np.zeros_like(middle), 0.0, 0.0
+    for place, weight in QUADRATURE:
+        eta = evidence.hyperprior.within(local.eta + place * line)
+        there = evidence.conditional(eta) if place else law
+        if there is None:
+            continue
+        part = weight * np.exp(least - evidence.alone(eta) + 0.5 * place**2)
+        covariance += part * (there.covariance if place else middle)
+        square, total = square + part * np.exp(2.0 * eta[FORCE]), total + part
+    return covariance / total - middle, float(np.sqrt(square / total))

@@ -180,7 +180,7 @@ def uncertainty(
         moving[problem.pose_part] = False
     values, vectors = np.linalg.eigh(posterior.covariance[np.ix_(moving, moving)])  # the others are integrated out
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return Uncertainty(np.hstack([slopes[:, moving] @ root, posterior.scales.force * unseen]), rest)
+    return Uncertainty(np.hstack([slopes[:, moving] @ root, posterior.force * unseen]), rest)
 
 
 def _by_unknowns(problem: Problem, evaluation: Evaluation) -> Floats:

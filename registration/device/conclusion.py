@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..loss import REJECTED
 from ..policy import ACCURACY, POLICY
-from .evidence import ERROR, FORCE, NOISE, scale_covariance
+from .evidence import ERROR, NOISE, over_force_scale, scale_covariance
 from .operations import Local, Operations, rms
 from .pose import seen_slopes
 
@@ -84,9 +84,9 @@ class Conclusion:
                 turn = (axes @ rotation)[:, None]
                 slopes = torch.cat([turn @ slopes, torch.stack(by_pose, dim=2)], dim=3)
                 unseen = turn @ unseen @ turn.mT
-        covariance, believed = self._posterior(local)
+        covariance, believed, force_square = self._posterior(local)
         nodes = slopes @ covariance[:, self._moving[:, None], self._moving][:, None] @ slopes.mT
-        nodes = nodes + (2.0 * local.eta[:, FORCE]).exp()[:, None, None, None] * unseen
+        nodes = nodes + force_square[:, None, None, None] * unseen
         rest = ((believed * moved)[:, None] * by.whole_rest).square()
         nodes = nodes + rest[:, :, None, None] * torch.eye(3, dtype=c.dtype, device=c.device)
         is_rejected = (local.weights < REJECTED) & is_point
@@ -116,8 +116,12 @@ class Conclusion:
         bends = 0.5 * ((variances @ told.square()) * variances).sum(dim=2)
         return (0.5 * slopes.clamp_min(0.0).square() / bends).amax(dim=1) >= ACCURACY.worth
 
-    def _posterior(self, local: Local) -> tuple[Tensor, Tensor]:
-        """Covariance of the coefficients, (b, k, k), and the scale of the model's error in margins, (b,): `laplace`."""
+    def _posterior(self, local: Local) -> tuple[Tensor, Tensor, Tensor]:
+        """See `laplace`.
+
+        Covariance of the coefficients, (b, k, k), scale of the model's error in margins, (b,), mean square of that of
+        forces, (b,), square newtons.
+        """
         eta, priors = local.eta, self._by.priors
         believed = torch.where(eta[:, ERROR] >= 0.0, eta[:, ERROR], POLICY.discrepancy_in_margins * eta[:, ERROR])
         seen = torch.cat([eta[:, :ERROR], believed[:, None]], dim=1)
@@ -125,8 +129,9 @@ class Conclusion:
         there, whole = (_variances(each, local.sums.error) for each in (eta, seen))
         told = ((whole / there.square())[:, None] @ local.sums.information.flatten(2)).view_as(local.inverse)
         covariance = local.inverse @ (torch.diag_embed(held) + told) @ local.inverse
-        shift = local.inverse @ local.by_scales
-        return covariance + shift @ scale_covariance(local.sums, priors, eta) @ shift.mT, torch.exp(believed)
+        shift, spread = local.inverse @ local.by_scales, scale_covariance(local.sums, priors, eta)
+        widened, square = over_force_scale(local.sums, priors, eta, spread)
+        return covariance + shift @ spread @ shift.mT + widened, torch.exp(believed), square
 
     def _margins(self, covariances: Tensor) -> Tensor:
         """See `uncertainty.margins_of`; linear between the values of a table, which is good to 1e-8."""

@@ -8,15 +8,19 @@ them and the noise.
 
 from __future__ import annotations
 
+from math import log
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from ..hyperparameters import QUADRATURE
+
 NOISE, FORCE, ERROR = range(3)  # order of the scales' logarithms here
 _LONGEST = 1.0  # of a logarithm, that one step may take
 _STEP = 1e-5  # of a logarithm, for a difference
 _AT_BOUND = 0.02  # of a logarithm: so near to a bound it lies at it
+_TINY = 1e-300
 
 
 class Sums(NamedTuple):
@@ -48,6 +52,7 @@ class Law(NamedTuple):
         mean: (b, k).
         precision: one over the groups' variances, (b, g).
         by_noise: derivatives of the logarithms of these variances, (b, 3, g).
+        log_determinant: of the precision, (b,).
     """
 
     root: Tensor
@@ -55,6 +60,7 @@ class Law(NamedTuple):
     mean: Tensor
     precision: Tensor
     by_noise: Tensor
+    log_determinant: Tensor
 
 
 class Hyperpriors(NamedTuple):
@@ -112,7 +118,18 @@ def law_of(sums: Sums, priors: Hyperpriors, eta: Tensor) -> Law:
     inverse_factor = torch.linalg.solve_triangular(factor, identity, upper=False)
     inverse = inverse_factor.mT @ inverse_factor
     projection = root * (precision[:, None] @ sums.projection)[:, 0]
-    return Law(root, inverse, (inverse @ projection[..., None])[..., 0], precision, by_noise)
+    mean = (inverse @ projection[..., None])[..., 0]
+    determinant = 2.0 * factor.diagonal(dim1=1, dim2=2).log().sum(dim=1)
+    return Law(root, inverse, mean, precision, by_noise, determinant)
+
+
+def value_of(sums: Sums, priors: Hyperpriors, eta: Tensor, law: Law) -> Tensor:
+    """Minus the logarithm of the evidence times what is believed, (b,)."""
+    projection = (law.precision[:, None] @ sums.projection)[:, 0]
+    square = (law.precision * (sums.square + sums.tail)).sum(dim=1) - (law.root * law.mean * projection).sum(dim=1)
+    slope, bend = priors.cost(eta)
+    believed = (slope.square() / bend).sum(dim=1)
+    return 0.5 * (square - (sums.weight * law.precision.log()).sum(dim=1) + law.log_determinant + believed)
 
 
 def slope_of(sums: Sums, priors: Hyperpriors, eta: Tensor, law: Law) -> Tensor:
@@ -185,6 +202,29 @@ def scale_covariance(sums: Sums, priors: Hyperpriors, eta: Tensor) -> Tensor:
     values, vectors = eigen(scaled + unit)
     root = spread[:, :, None] * vectors * values.clamp_min(1.0).rsqrt()[:, None]  # in no direction wider than believed
     return root @ root.mT
+
+
+def over_force_scale(sums: Sums, priors: Hyperpriors, eta: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
+    """What the doubt of the forces' scale adds to the covariance, (b, k, k), and its mean square, (b,): `laplace`.
+
+    Args:
+        sums: what the points tell.
+        priors: of scales and unknowns.
+        eta: logarithms of the scales, (b, 3).
+        spread: their covariance, (b, 3, 3).
+    """
+    line = spread[:, FORCE] / spread[:, FORCE, FORCE].sqrt().clamp_min(_TINY)[:, None]
+    nodes = [priors.within(eta + place * line) for place, _ in QUADRATURE]
+    laws = [law_of(sums, priors, each) for each in nodes]
+    density = [
+        log(weight) + 0.5 * place**2 - value_of(sums, priors, node, law)
+        for (place, weight), node, law in zip(QUADRATURE, nodes, laws, strict=True)
+    ]
+    weights = torch.softmax(torch.stack(density, dim=1), dim=1)
+    every = torch.stack([law.root[:, :, None] * law.inverse * law.root[:, None] for law in laws], dim=1)
+    mean = (weights[:, None] @ every.flatten(2)).view_as(laws[0].inverse)
+    square = (weights * torch.stack([(2.0 * each[:, FORCE]).exp() for each in nodes], dim=1)).sum(dim=1)
+    return mean - every[:, len(nodes) // 2], square
 
 
 def eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:

@@ -140,7 +140,10 @@ def test_a_scale_that_is_known_stays(body: Body, rng: np.random.Generator) -> No
 
 
 def test_without_data_the_posterior_is_the_prior(body: Body, rng: np.random.Generator) -> None:
-    """All points are outliers: each block of unknowns keeps its own variance, each scale its median."""
+    """All points are outliers: each block of unknowns keeps its own variance, each scale its median.
+
+    Of forces the variance is the mean of the square of their scale, which is log-normal.
+    """
     observed = SurfaceDistance(body, body.surfaces["observed"])
     error = ModelError(patterns(body), observed)
     pose = PosePrior(Pose.identity(), body.points.mean(axis=0))
@@ -151,7 +154,8 @@ def test_without_data_the_posterior_is_the_prior(body: Body, rng: np.random.Gene
     found, hyperprior = posterior(local), given.hyperprior
     np.testing.assert_allclose(local.eta, hyperprior.median, atol=0.05)
     shared = POLICY.shared_size**2 * np.exp(observed.modes.log_variances(local.scales.length)[0])
-    variances = [np.full(given.forces.size, 0.05**2), np.ones(6 + 2), np.exp(error.remainder.logs), np.tile(shared, 3)]
+    force = 0.05**2 * np.exp(2.0 * given.forces.scale.spread**2)
+    variances = [np.full(given.forces.size, force), np.ones(6 + 2), np.exp(error.remainder.logs), np.tile(shared, 3)]
     np.testing.assert_allclose(np.diag(found.covariance), np.concatenate(variances), rtol=0.02)
     off = found.covariance - np.diag(np.diag(found.covariance))
     np.testing.assert_allclose(off, 0.0, atol=1e-12)
@@ -167,16 +171,20 @@ def dense_evidence(local: LocalModel, force: float) -> float:
     return 0.5 * float(np.linalg.slogdet(covariance)[1] + data @ np.linalg.solve(covariance, data) + believed)
 
 
-def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(body: Body, rng: np.random.Generator) -> None:
-    """As far as the mean moves with the scale, by differences, beside the covariance at that scale.
+@pytest.mark.parametrize("axes", [(1, 2), (0, 1, 2)])
+def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(
+    body: Body, rng: np.random.Generator, axes: tuple[int, ...]
+) -> None:
+    """As far as the mean moves with the scale, by differences, beside the covariance's own mean over all scales.
 
     The scale is the most likely one, its doubt the curvature there, of the normal law of all points. These are few and
-    said to be bad, so that what is found depends on the scale; planes let the descent end at the minimum itself.
+    said to be bad, so that what is found depends on the scale; planes let the descent end at the minimum itself. Of a
+    pull along the axis they tell little: its variance is larger in the mean than at the most likely scale.
     """
     truth = Cantilever(body).solve(tip_forces(body, (0.0, 0.3, -0.8))).displacement
     cloud, planes = cloud_on(body, truth, 60, rng, 1e-3), SurfaceDistance(body, body.surfaces["observed"], "plane")
     every = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 1.0))
-    across = np.kron(np.full((len(every.nodes), 1), len(every.nodes) ** -0.5), np.eye(3)[:, 1:])  # all nodes together
+    across = np.kron(np.full((len(every.nodes), 1), len(every.nodes) ** -0.5), np.eye(3)[:, axes])  # all nodes together
     forces, noise = every.combined(across), LogNormalPrior(0.05, 0.0)
     local = settled(problem(body, rng, forces=forces, cloud=cloud, observed=planes, noise=noise))
     force, step = local.scales.force, 0.02
@@ -191,11 +199,23 @@ def test_doubt_in_the_forces_scale_is_doubt_in_the_forces(body: Body, rng: np.ra
         return held.evaluation.coefficients - held.solved(held.gradient[:, None])[:, 0]
 
     slope = (mean(force * np.exp(1e-4)) - mean(force * np.exp(-1e-4))) / 2e-4
-    alone = np.linalg.inv(local.jacobian.T @ local.jacobian / local.noise**2 + np.eye(len(slope)) / force**2)
-    added = posterior(local).covariance - alone
-    wanted = np.outer(slope, slope) / curvature
+
+    def alone(scale: float) -> Floats:
+        told = local.jacobian.T @ local.jacobian / local.noise**2
+        return np.linalg.inv(told + np.eye(len(slope)) / scale**2)
+
+    every = force * np.exp(np.linspace(-5.0, 5.0, 101) / np.sqrt(curvature))
+    density = np.exp(here - np.array([dense_evidence(local, scale) for scale in every]))
+    density /= density.sum()
+    mean_covariance = sum(part * alone(scale) for part, scale in zip(density, every, strict=True))
+    found, by_mean = posterior(local), np.outer(slope, slope) / curvature
+    added, wanted = found.covariance - alone(force), by_mean + mean_covariance - alone(force)
     np.testing.assert_allclose(added, wanted, atol=0.03 * np.abs(wanted).max())
-    assert np.trace(wanted) > 0.1 * np.trace(alone)
+    if 0 in axes:
+        assert found.covariance[0, 0] > 1.05 * (alone(force) + by_mean)[0, 0]
+    else:
+        assert np.trace(by_mean) > 0.1 * np.trace(alone(force))
+    assert found.force == pytest.approx(np.sqrt(density @ every**2), rel=0.03)
 
 
 def test_smooth_forces_correlate_and_keep_their_scale(body: Body) -> None:
