@@ -72,14 +72,15 @@ def _by_force_scale(local: LocalModel, spread: Floats) -> tuple[Floats | float, 
     law = evidence.conditional(local.eta)
     if deviation == 0.0 or law is None:
         return 0.0, local.scales.force
-    line, least, middle = spread[:, FORCE] / deviation, evidence.alone(local.eta), law.covariance
-    covariance, square, total = np.zeros_like(middle), 0.0, 0.0
+    line, least = spread[:, FORCE] / deviation, evidence.alone(local.eta)
+    widened, square, total = np.zeros_like(law.factor), 0.0, 0.0
     for place, weight in QUADRATURE:
         eta = evidence.hyperprior.within(local.eta + place * line)
         there = evidence.conditional(eta) if place else law
         if there is None:
             continue
         part = weight * np.exp(least - evidence.alone(eta) + 0.5 * place**2)
-        covariance += part * (there.covariance if place else middle)
+        widened += (part * there.root)[:, None] * there.lower * there.root
         square, total = square + part * np.exp(2.0 * eta[FORCE]), total + part
-    return covariance / total - middle, float(np.sqrt(square / total))
+    widened = np.tril(widened / total - law.root[:, None] * law.lower * law.root)
+    return widened + np.tril(widened, -1).T, float(np.sqrt(square / total))
