@@ -314,7 +314,7 @@ class Registrar:
         cold = self._concluded(finish(self.setup, points, begun), begin)
         if cold.shared_noise_dominates and not self.setup.is_late:
             with suppress(NotConverged):
-                again = localise(self.setup, points, max(1, ACCURACY.leading // 2))
+                again = localise(self.setup, points, max(1, self.options.localisation.leading // 2))
                 other = self._concluded(finish(self.setup, points, again), begin)
                 cold = other if POLICY.excess * other.scatter < cold.scatter else cold
         return cold if known is None or not self.setup.is_late else min(known, cold, key=badness)
@@ -360,10 +360,11 @@ def prepare(
         ValueError: no node is left on the free boundary; nothing is unknown; conditions that the model does not take.
     """
     options = options or RegistrationOptions()
-    if along_normals:  # a pressure acts all over the surface
-        options = replace(options, localisation=replace(options.localisation, rounds=0))
+    if along_normals:  # a pressure acts all over the surface, and those that press the body as a whole are not bounded
+        options = replace(options, localisation=replace(options.localisation, rounds=0, leading=directions))
     observed = SurfaceDistance(model.body, triangles, options.distance)
-    scale = LogNormalPrior(force_scale, POLICY.force_spread, minimum=1e-2 * force_scale)
+    spread = 0.0 if along_normals else POLICY.force_spread
+    scale = LogNormalPrior(force_scale, spread, minimum=1e-2 * force_scale)
     if nodes is None:
         if inputs is None and pose is None and blocks is None:
             raise ValueError("prepare.nodes: expected nodes that may carry force where nothing else is unknown.")

@@ -18,7 +18,6 @@ from ..gauss_newton import GaussNewton, SolverResult
 from ..lbfgs import LBFGS
 from ..outcome import Outcome
 from ..parameters.nodal_forces import localised, reweighting
-from ..policy import ACCURACY
 from ..prepared import Prepared
 from ..problem import Problem
 from ..setup import Ended, Setup, after
@@ -43,7 +42,7 @@ def localise(setup: Setup, points: Cloud, leading: int | None = None) -> Localis
     Args:
         setup: what is registered.
         points: of the cloud.
-        leading: directions of force to begin with; `ACCURACY.leading` if not given.
+        leading: directions of force to begin with; those of the options if not given.
     """
     prepared, rule, solver = setup.unlocalised, setup.options.localisation, setup.options.solver
     if rule.rounds == 0:
@@ -90,7 +89,8 @@ def _carried_on(problem: Problem, solver: GaussNewton | LBFGS, found: SolverResu
 
 def _led(setup: Setup, points: Cloud, prepared: Prepared, leading: int | None) -> SolverResult:
     """From rest, with the leading directions of force alone, which cannot fold the surface into a wrong minimum."""
-    few, first = points.thinned(setup.options.localisation.points), prepared.leading(leading or ACCURACY.leading)
+    rule = setup.options.localisation
+    few, first = points.thinned(rule.points), prepared.leading(leading or rule.leading)
     coarse = setup.plain(few, first).unshared
     return setup.options.solver.coarse().solve(coarse, np.zeros(coarse.size))
 
