@@ -561,21 +561,13 @@ class Twin:
         return self._registrars[zone]
 
     def _prepared(self, zone: str, camera: PosePrior | None) -> Engine:
-        section = self.config.registration
-        is_known_where = bool(zone) or section.forces == "normal"
-
-        def posed(plain: Registrar) -> Registrar:
-            assert camera is not None
-            options = _options(section, options_for(plain.model, is_known_where))
-            return plain.with_pose(camera, options)
-
         if camera is not None:
             plain = self.registrar(zone)
             if isinstance(plain, HybridRegistrar):
-                return HybridRegistrar(posed(plain.fast), posed(plain.exact))
+                return HybridRegistrar(plain.fast.with_pose(camera), plain.exact.with_pose(camera))
             if isinstance(plain, ContactRegistrar):
-                return ContactRegistrar(posed(plain.anywhere), plain.patch)
-            return posed(plain)
+                return ContactRegistrar(plain.anywhere.with_pose(camera), plain.patch)
+            return plain.with_pose(camera)
         patch = Scenario.of(self.config).patch
         exact = self._alone(self.model, zone)
         if patch is not None:

@@ -118,20 +118,20 @@ class Registrar:
         """Noise, solver, thinning, search for the place of the forces."""
         return self.setup.options
 
-    def with_pose(self, pose: PosePrior, options: RegistrationOptions) -> Registrar:
-        """The same with an unknown pose, and the options that suit it."""
+    def with_pose(self, pose: PosePrior) -> Registrar:
+        """The same with an unknown pose."""
         anywhere, setup = self.anywhere, self.setup
         posed = Registrar(
             setup.model,
             setup.observed,
             setup.forces,
-            options,
+            self.options,
             pose=pose,
             expectations=self._told,
             inputs=setup.inputs,
             blocks=setup.blocks,
             modulus_deviation=self.modulus_deviation,
-            anywhere=None if anywhere is None else lambda: anywhere().with_pose(pose, options),
+            anywhere=None if anywhere is None else lambda: anywhere().with_pose(pose),
         )
         return posed.with_terms(*setup.terms)
 

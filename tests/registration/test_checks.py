@@ -118,6 +118,6 @@ def test_expectations_that_were_given_stay_with_a_pose(body: Body, found: Regist
     observed = SurfaceDistance(body, body.surfaces["observed"])
     made = Registrar(Cantilever(body, learned=2.0), observed, forces, expectations=strict)
     camera = PosePrior(Pose.identity(), body.points.mean(axis=0), 0.1, 0.01)
-    assert made.with_pose(camera, made.options).setup.expectations is strict
+    assert made.with_pose(camera).setup.expectations is strict
     usual = Registrar(made.model, observed, forces)
-    assert usual.with_pose(camera, usual.options).setup.expectations == usual.setup.expectations
+    assert usual.with_pose(camera).setup.expectations == usual.setup.expectations

@@ -224,4 +224,5 @@ def test_another_pose_keeps_what_pulls_beside_the_cloud(body: Body) -> None:
     made = engine(Bent(body), Bent(body)).exact
     marks = LandmarkPairs.of(made.observed, body.points[made.observed.nodes[:3]], body.points[made.observed.nodes[:3]])
     pose = PosePrior(Pose.identity(), body.points.mean(axis=0))
-    assert made.with_terms(marks).with_pose(pose, made.options).setup.terms == (marks,)
+    posed = made.with_terms(marks).with_pose(pose)
+    assert posed.setup.terms == (marks,) and posed.options is made.options

@@ -15,6 +15,8 @@ from softtwin.registration.parameters import nodal_forces as nodal_forces_module
 from softtwin.registration.parameters.inputs import InputBlocks
 from softtwin.registration.parameters.nodal_forces import nodal_forces, normal_forces
 from softtwin.registration.parameters.weight import Weight
+from softtwin.registration.policy import ACCURACY
+from softtwin.registration.pose import Pose, PosePrior
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.surrogate.equilibria import Equilibria
 from softtwin.surrogate.equilibria_model import EquilibriaModel
@@ -132,6 +134,17 @@ def test_a_pressure_is_found_inside_too(block: Body, model: EquilibriaModel, rng
             margins = found.camera_uncertainty.margin(confidence=0.95)
             assert np.mean((errors[True] < margins)[is_free]) > 0.9
     assert errors[True].mean() < 0.5 * errors[False].mean()
+
+
+def test_a_pressures_size_is_known_and_its_search_begins_with_all_of_it(model: EquilibriaModel) -> None:
+    """Unknown pose or not: what presses the body as a whole is not bounded, so that a few directions go far astray."""
+    registrar = everywhere(model)
+    posed = registrar.with_pose(PosePrior(Pose.identity(), model.body.points.mean(axis=0)))
+    for made in (registrar, posed):
+        assert made.setup.forces.scale.spread == 0.0
+        assert made.options.localisation.leading >= made.setup.forces.size > ACCURACY.leading
+        assert made.options.localisation.rounds == 0
+    assert everywhere(model, along=False).setup.forces.scale.spread > 0.0
 
 
 def test_a_weight_is_found_by_its_factor(block: Body, model: EquilibriaModel, rng: np.random.Generator) -> None:
