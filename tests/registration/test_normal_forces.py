@@ -14,9 +14,10 @@ from softtwin.registration.options import expected_force, options_for
 from softtwin.registration.parameters import nodal_forces as nodal_forces_module
 from softtwin.registration.parameters.inputs import InputBlocks
 from softtwin.registration.parameters.nodal_forces import nodal_forces, normal_forces
+from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.parameters.weight import Weight
 from softtwin.registration.policy import ACCURACY
-from softtwin.registration.pose import Pose, PosePrior
+from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registrar, prepare
 from softtwin.surrogate.equilibria import Equilibria
 from softtwin.surrogate.equilibria_model import EquilibriaModel
