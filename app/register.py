@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
+from softtwin.meshes.compiled import told_when_compiling
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.io import Axes, ContentError, FileError, Unit, is_companion, read_points
 from softtwin.meshes.io.clouds import TABLES
@@ -326,7 +327,8 @@ class Scene:
             fit = camera_from_landmarks(*start.landmarks, self.inside, self.outside)
             say(describe_landmarks(fit))
             pose = fit.pose
-        with self.home.twin(**self.options) as twin:
+        once = "compiling for this machine, once: the first frame waits for it"
+        with told_when_compiling(lambda: say(once)), self.home.twin(**self.options) as twin:
             is_fitted = start.landmarks is not None
             yield twin, "align" if start.align else camera_of(twin, pose, is_fitted=is_fitted)
 

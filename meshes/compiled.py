@@ -6,6 +6,7 @@ numba brings a compiler. What has loops for it has another way, too, for machine
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 try:
@@ -31,3 +32,28 @@ def compiled(function: Function) -> Function:
         made = numba.njit(error_model="numpy")(function)
     found: Function = made
     return found
+
+
+def told_when_compiling(say: Callable[[], object]) -> AbstractContextManager[object]:
+    """A context in which the first loop that is compiled is told of: it takes seconds, and is kept for later processes.
+
+    Args:
+        say: called once at most.
+    """
+    if numba is None:
+        return nullcontext()
+    from numba.core import event
+
+    class Compiling(event.Listener):  # type: ignore[misc]
+        is_said = False
+
+        def on_start(self, event: object) -> None:
+            if not self.is_said:
+                self.is_said = True
+                say()
+
+        def on_end(self, event: object) -> None:
+            pass
+
+    listening: AbstractContextManager[object] = event.install_listener("numba:compile", Compiling())
+    return listening
