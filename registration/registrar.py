@@ -304,17 +304,18 @@ class Registrar:
     def _cold(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
         """From rest; once more, from fewer directions, where neighbours share more noise than each point has alone.
 
-        So it looks in a wrong minimum, as it does with a camera or a model that errs by patches. The second result is
-        taken where it meets the cloud much better. Where time is over before the end, the better one of this and what
-        is known; that at once, if it is accepted.
+        So it looks in a wrong minimum, as it does with a camera or a model that errs by patches; a search that began
+        with all directions was led by none. The second result is taken where it meets the cloud much better. Where time
+        is over before the end, the better one of this and what is known; that at once, if it is accepted.
         """
         begun = localise(self.setup, points)
         if known is not None and self.setup.is_late and known.judgement.verdict is Verdict.ACCEPTED:
             return known
         cold = self._concluded(finish(self.setup, points, begun), begin)
-        if cold.shared_noise_dominates and not self.setup.is_late:
+        leading = self.options.localisation.leading
+        if leading < self.setup.forces.size and cold.shared_noise_dominates and not self.setup.is_late:
             with suppress(NotConverged):
-                again = localise(self.setup, points, max(1, self.options.localisation.leading // 2))
+                again = localise(self.setup, points, max(1, leading // 2))
                 other = self._concluded(finish(self.setup, points, again), begin)
                 cold = other if POLICY.excess * other.scatter < cold.scatter else cold
         return cold if known is None or not self.setup.is_late else min(known, cold, key=badness)
