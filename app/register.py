@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from softtwin.meshes.body import Body
 from softtwin.meshes.clouds import CloudError
-from softtwin.meshes.compiled import told_when_compiling
+from softtwin.meshes.compiled import said_when_compiling
 from softtwin.meshes.export import Coordinates
 from softtwin.meshes.io import Axes, ContentError, FileError, Unit, is_companion, read_points
 from softtwin.meshes.io.clouds import TABLES
@@ -328,7 +328,7 @@ class Scene:
             say(describe_landmarks(fit))
             pose = fit.pose
         once = "compiling for this machine, once: the first frame waits for it"
-        with told_when_compiling(lambda: say(once)), self.home.twin(**self.options) as twin:
+        with said_when_compiling(lambda: say(once)), self.home.twin(**self.options) as twin:
             is_fitted = start.landmarks is not None
             yield twin, "align" if start.align else camera_of(twin, pose, is_fitted=is_fitted)
 

@@ -34,7 +34,7 @@ def compiled(function: Function) -> Function:
     return found
 
 
-def told_when_compiling(say: Callable[[], object]) -> AbstractContextManager[object]:
+def said_when_compiling(say: Callable[[], object]) -> AbstractContextManager[object]:
     """A context in which the first loop that is compiled is told of: it takes seconds, and is kept for later processes.
 
     Args:

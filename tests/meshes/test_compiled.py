@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softtwin.meshes import compiled as compiled_module
-from softtwin.meshes.compiled import compiled, told_when_compiling
+from softtwin.meshes.compiled import compiled, said_when_compiling
 
 
 def test_the_first_loop_that_is_compiled_is_told_of() -> None:
@@ -18,7 +18,7 @@ def test_the_first_loop_that_is_compiled_is_told_of() -> None:
 
     first, second, said = made(), made(), list[str]()
     first(np.ones(3))
-    with told_when_compiling(lambda: said.append("compiling")):
+    with said_when_compiling(lambda: said.append("compiling")):
         first(np.ones(4))
         assert not said
         second(np.ones(3))
@@ -31,5 +31,5 @@ def test_the_first_loop_that_is_compiled_is_told_of() -> None:
 
 def test_without_a_compiler_nothing_is_told(monkeypatch) -> None:
     monkeypatch.setattr(compiled_module, "numba", None)
-    with told_when_compiling(lambda: pytest.fail("told")):
+    with said_when_compiling(lambda: pytest.fail("told")):
         assert compiled(abs) is abs
