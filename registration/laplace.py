@@ -72,15 +72,15 @@ def _by_force_scale(local: LocalModel, spread: Floats) -> tuple[Floats | float, 
     law = evidence.conditional(local.eta)
     if deviation == 0.0 or law is None:
         return 0.0, local.scales.force
-    line, least = spread[:, FORCE] / deviation, evidence.alone(local.eta)
-    widened, square, total = np.zeros_like(law.factor), 0.0, 0.0
-    for place, weight in QUADRATURE:
-        eta = evidence.hyperprior.within(local.eta + place * line)
-        there = evidence.conditional(eta) if place else law
-        if there is None:
-            continue
-        part = weight * np.exp(least - evidence.alone(eta) + 0.5 * place**2)
-        widened += (part * there.root)[:, None] * there.lower * there.root
-        square, total = square + part * np.exp(2.0 * eta[FORCE]), total + part
-    widened = np.tril(widened / total - law.root[:, None] * law.lower * law.root)
-    return widened + np.tril(widened, -1).T, float(np.sqrt(square / total))
+    line = spread[:, FORCE] / deviation
+    nodes = [evidence.hyperprior.within(local.eta + place * line) for place, _ in QUADRATURE]
+    density = np.array([np.log(weight) + 0.5 * place**2 for place, weight in QUADRATURE])
+    density -= [evidence.alone(eta) for eta in nodes]
+    parts = np.exp(density - density.max())
+    parts /= parts.sum()
+    widened = -law.root[:, None] * law.lower * law.root
+    for part, there in zip(parts, map(evidence.conditional, nodes), strict=True):
+        if there is not None:
+            widened += (part * there.root)[:, None] * there.lower * there.root
+    widened = np.tril(widened)
+    return widened + np.tril(widened, -1).T, float(np.sqrt(parts @ np.exp(2.0 * np.array(nodes)[:, FORCE])))
