@@ -35,10 +35,10 @@ def compiled(function: Function) -> Function:
 
 
 def said_when_compiling(say: Callable[[], object]) -> AbstractContextManager[object]:
-    """A context in which the first loop that is compiled is told of: it takes seconds, and is kept for later processes.
+    """A context that calls `say` when numba compiles the first loop in it: that takes seconds, once a machine.
 
     Args:
-        say: called once at most.
+        say: called once at most; never for loops that an earlier process has compiled and kept.
     """
     if numba is None:
         return nullcontext()

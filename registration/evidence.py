@@ -225,7 +225,7 @@ class Evidence:
         """At logarithms of the hyperparameters, (h,), with the gradient, (h,)."""
         return self._at(eta)[:2]
 
-    def alone(self, eta: Floats) -> float:
+    def value_alone(self, eta: Floats) -> float:
         """The same without its gradient; infinity where information and prior are too far apart."""
         law = self.conditional(eta)
         return np.inf if law is None else self._value(eta, law, self.noise(eta)[0])[0]

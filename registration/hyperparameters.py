@@ -14,7 +14,7 @@ from .policy import POLICY
 
 Floats = NDArray[np.float64]
 NOISE, FORCE, SHARED, LENGTH, DISCREPANCY = range(5)  # their order in arrays, that of `Hyperparameters`
-# Gauss's and Hermite's quadrature: places in standard deviations about the middle, and their weights, which sum to one.
+# Gauss-Hermite quadrature: places in standard deviations about the mean, and their weights, which sum to one.
 _PLACES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(5)
 QUADRATURE = tuple(zip(_PLACES.tolist(), (_WEIGHTS / _WEIGHTS.sum()).tolist(), strict=True))
 

@@ -13,14 +13,14 @@ Floats = NDArray[np.float64]
 
 
 def posterior(local: LocalModel) -> Posterior:
-    """The normal law at a trial, with what the doubt of the hyperparameters moves and widens.
+    """The normal law at a trial; the uncertainty of the hyperparameters moves its mean and widens its covariance.
 
     Args:
         local: the objective's model there.
     """
     informed = float(local.informed[local.problem.moving].sum())
     moved, spread = _by_hyperparameters(local)
-    widened, force = _by_force_scale(local, spread)
+    widened, force = _mixed_over_force_scale(local, spread)
     covariance = error_covariance(local) + moved @ spread @ moved.T + widened
     return Posterior(local.evaluation.coefficients, covariance, local.scales, informed, force)
 
@@ -56,13 +56,13 @@ def _by_hyperparameters(local: LocalModel) -> tuple[Floats, Floats]:
     return local.inverse @ columns, local.evidence.covariance(local.eta)
 
 
-def _by_force_scale(local: LocalModel, spread: Floats) -> tuple[Floats | float, float]:
-    """What the doubt of the forces' scale adds to the covariance, (k, k), and the root of its mean square, newtons.
+def _mixed_over_force_scale(local: LocalModel, spread: Floats) -> tuple[Floats | float, float]:
+    """What the uncertainty of the forces' scale adds to the covariance, (k, k), and its root mean square, newtons.
 
-    Of directions that the cloud does not tell the variance is the square of the scale, and few directions that it tells
-    leave the scale in doubt. The unknowns' covariance is therefore its mean over the scale (integrated nested Laplace
-    approximations: Rue, Martino and Chopin 2009, 3.2), by Gauss's and Hermite's quadrature with the evidence itself as
-    the density; the other hyperparameters follow along their regression.
+    A force of which the cloud says nothing has the square of the scale as its variance, and a cloud that informs few
+    directions leaves the scale uncertain. The covariance is therefore the mean of the conditional ones over the scale
+    (integrated nested Laplace approximations: Rue, Martino and Chopin 2009, 3.2). Gauss-Hermite quadrature takes this
+    mean with the evidence as density; the other hyperparameters follow the scale by linear regression.
 
     Args:
         local: the objective's model at the end.
@@ -75,7 +75,7 @@ def _by_force_scale(local: LocalModel, spread: Floats) -> tuple[Floats | float, 
     line = spread[:, FORCE] / deviation
     nodes = [evidence.hyperprior.within(local.eta + place * line) for place, _ in QUADRATURE]
     density = np.array([np.log(weight) + 0.5 * place**2 for place, weight in QUADRATURE])
-    density -= [evidence.alone(eta) for eta in nodes]
+    density -= [evidence.value_alone(eta) for eta in nodes]
     parts = np.exp(density - density.max())
     parts /= parts.sum()
     widened = -law.root[:, None] * law.lower * law.root

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..loss import REJECTED
 from ..policy import ACCURACY, POLICY
-from .evidence import ERROR, NOISE, over_force_scale, scale_covariance
+from .evidence import ERROR, NOISE, mixed_over_force_scale, scale_covariance
 from .operations import Local, Operations, rms
 from .pose import seen_slopes
 
@@ -130,7 +130,7 @@ class Conclusion:
         told = ((whole / there.square())[:, None] @ local.sums.information.flatten(2)).view_as(local.inverse)
         covariance = local.inverse @ (torch.diag_embed(held) + told) @ local.inverse
         shift, spread = local.inverse @ local.by_scales, scale_covariance(local.sums, priors, eta)
-        widened, square = over_force_scale(local.sums, priors, eta, spread)
+        widened, square = mixed_over_force_scale(local.sums, priors, eta, spread)
         return covariance + shift @ spread @ shift.mT + widened, torch.exp(believed), square
 
     def _margins(self, covariances: Tensor) -> Tensor:

@@ -204,8 +204,8 @@ def scale_covariance(sums: Sums, priors: Hyperpriors, eta: Tensor) -> Tensor:
     return root @ root.mT
 
 
-def over_force_scale(sums: Sums, priors: Hyperpriors, eta: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
-    """What the doubt of the forces' scale adds to the covariance, (b, k, k), and its mean square, (b,): `laplace`.
+def mixed_over_force_scale(sums: Sums, priors: Hyperpriors, eta: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
+    """What the scale's uncertainty adds to the covariance, (b, k, k), and its mean square, (b,): see `laplace`.
 
     Args:
         sums: what the points tell.
