@@ -5,8 +5,9 @@
 
 Five patients of the DIR-Lab COPDgene set (../shared/data/lungs), each lung by itself, one setting for all
 (examples/lung.toml). Each row is what docs/validate.md shows: `softtwin mesh`, then `softtwin evaluate` with the cloud
-of the whole surface, of its lateral half, or of the whole surface with a model that knows of no gravity. Landmarks
-pull nothing; their regions are widened by 1 mm, as experts differ.
+of the whole surface, of its lateral half, of the whole surface with a model that knows of no gravity, or of the whole
+surface with a fifth of its points put anywhere. Landmarks pull nothing; their regions are widened by 1 mm, as experts
+differ.
 """
 
 from __future__ import annotations
@@ -21,12 +22,16 @@ from typing import Any
 import numpy as np
 from columns import Column
 from harness import Benchmark, Figures, Given, run
+from numpy.typing import NDArray
 from record import ROOT, RUNS
+
+Floats = NDArray[np.float64]
 
 LUNGS = ROOT.parent / "shared" / "data" / "lungs"
 CASES, SIDES = (2, 4, 5, 7, 9), {"right": 1, "left": 2}
-SEEN = {"whole": "", "half": "_half_lateral", "no gravity": ""}
+SEEN = {"whole": "", "half": "_half_lateral", "no gravity": "", "outliers": ""}
 GRAVITY = "gravity = [0.0, -9.81, 0.0]"
+OUTLIERS, BEYOND = 0.2, 0.2  # of the points; how far beyond the cloud these lie, of its extent
 LOCALISATION = 0.001  # metres: what setting a landmark again differs by (Castillo et al. 2013)
 ROWS = {f"case {case}, {side}, {seen}": (case, side, seen) for seen in SEEN for case in CASES for side in SIDES}
 
@@ -60,6 +65,15 @@ def prepared(case: int, side: str) -> tuple[Path, float]:
     return folder, time.perf_counter() - begin
 
 
+def with_outliers(cloud: Floats, rng: np.random.Generator) -> Floats:
+    """The same with a fifth of the points anywhere in a box around the cloud."""
+    moved, wrong = cloud.copy(), rng.choice(len(cloud), int(OUTLIERS * len(cloud)), replace=False)
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    reach = BEYOND * (high - low)
+    moved[wrong] = rng.uniform(low - reach, high + reach, (len(wrong), 3))
+    return moved
+
+
 def best_affine(folder: Path) -> float:
     """Mean error of the affine map fitted to the landmarks themselves, mm: no method, a bound for affine ones."""
     rest, moved = (np.loadtxt(folder / f"landmarks_{name}.txt") for name in ("inspiration", "expiration"))
@@ -83,10 +97,16 @@ def work(row: str, given: Given) -> dict[str, Any]:
             raise ValueError(f"examples/lung.toml: expected {GRAVITY}.")
         organ = folder / "no-gravity.toml"
         organ.write_text(text.replace(GRAVITY, ""))
+    cloud = data / f"cloud_expiration_{SIDES[side]}{SEEN[seen]}.txt"
+    if seen == "outliers":
+        np.savetxt(
+            folder / "outliers.txt", with_outliers(np.loadtxt(cloud), np.random.default_rng([case, SIDES[side]]))
+        )
+        cloud = folder / "outliers.txt"
     begin = time.perf_counter()
     softtwin(
         *("evaluate", organ, "--unit", "mm", "--frame", "lps", "--output", output),
-        *("--cloud", data / f"cloud_expiration_{SIDES[side]}{SEEN[seen]}.txt", "--localisation-error", LOCALISATION),
+        *("--cloud", cloud, "--localisation-error", LOCALISATION),
         *("--landmarks", f"{folder / 'landmarks_inspiration.txt'}:mm:lps", folder / "landmarks_expiration.txt"),
     )
     seconds = time.perf_counter() - begin

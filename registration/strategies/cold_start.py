@@ -1,7 +1,8 @@
 """From rest: the leading directions of force first, then all; each round of gathering the forces goes on from there.
 
 A model whose error is known in patterns has them among its unknowns only with all points, in `finish`: before that they
-count as noise. An exact model, each state of which is dear, goes to the end of it at once.
+count as noise. An exact model, each state of which is dear, goes to the end of it at once. Points that lie by
+themselves wait for `finish`, too: about the edges of a surface that is yet far off they would be more than its own.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ def localise(setup: Setup, points: Cloud, leading: int | None = None) -> Localis
         leading: directions of force to begin with; those of the options if not given.
     """
     prepared, rule, solver = setup.unlocalised, setup.options.localisation, setup.options.solver
+    points = points.gathered
     if rule.rounds == 0:
         return Localised(prepared, begin(setup, points, prepared, solver.unsettled(), leading), False)
     few = points.thinned(rule.points)
@@ -74,6 +76,7 @@ def begin(
         solver: that ends it, where the model's error is not known in patterns.
         leading: as for `localise`.
     """
+    points = points.gathered
     begun = _led(setup, points, prepared, leading)
     if setup.error is not None and not setup.is_hopeless(begun):
         return begun
@@ -124,6 +127,8 @@ def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
     prepared, found, solver = begun.prepared, begun.found, setup.options.solver
     if setup.is_hopeless(found):
         solver = solver.without_steps()
+    elif points.gathered is not points:  # those that had to wait are told by how far off they are
+        solver = solver.directly()
     if setup.error is None:
         if not begun.is_settled or len(found.evaluation.cloud) < len(points):
             found = _from(setup.plain(points, prepared), solver, found)

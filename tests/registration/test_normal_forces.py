@@ -148,6 +148,21 @@ def test_a_pressures_size_is_known_and_its_search_begins_with_all_of_it(model: E
     assert everywhere(model, along=False).setup.forces.scale.spread > 0.0
 
 
+def test_points_anywhere_do_not_lead_a_pressures_search_astray(block: Body, model: EquilibriaModel) -> None:
+    """About the edges of a body that has shrunk by far, a fifth of wrong points are more than its own."""
+    is_free = ~np.isin(np.arange(len(block.points)), block.fixed)
+    truth = model.solve(-2000.0 * is_free[:, None] * area_vectors(block)).displacement
+    rng = np.random.default_rng(0)
+    cloud, registrar = whole_cloud(block, truth, rng, 1000), everywhere(model)
+    wrong, low, high = rng.choice(len(cloud), 200, replace=False), cloud.min(axis=0), cloud.max(axis=0)
+    clean, reach = np.delete(cloud, wrong, axis=0), 0.2 * (high - low)
+    cloud[wrong] = rng.uniform(low - reach, high + reach, (200, 3))
+    found, wanted = registrar.register(cloud), registrar.register(clean)
+    errors = [np.linalg.norm(each.displacement - truth, axis=1).mean() for each in (found, wanted)]
+    assert errors[0] < 2.0 * errors[1]
+    assert 0.15 < found.outliers < 0.25  # they count as what they are, though the search began without them
+
+
 def test_a_weight_is_found_by_its_factor(block: Body, model: EquilibriaModel, rng: np.random.Generator) -> None:
     """Where nothing else acts, the factor is told to a few parts in a hundred, whatever was expected."""
     weight = nodal_volumes(block)[:, None] * np.array([0.0, 0.0, -2000.0])
