@@ -16,7 +16,7 @@ from .formats.apart import read_apart
 from .formats.ply import read_ply_normals
 from .formats.table import Table, read_table
 from .formats.vtk import READERS
-from .raw import FARTHEST, read_anyhow
+from .raw import FARTHEST, SUFFIXES, read_anyhow
 
 _log = logging.getLogger(__name__)
 TABLES = (".txt", ".csv", ".xyz", ".pts", ".asc", ".tsv", ".xyzn", ".xyzrgb")
@@ -123,6 +123,9 @@ def _content(path: Path, normals: bool) -> tuple[Floats, Floats | None, list[str
     if suffix == ".pcd":
         points = _read_pcd(path, _PCD[: 6 if normals else 3])
         return points[:, :3], points[:, 3:] if normals else None, []
+    if suffix not in SUFFIXES:
+        known = ", ".join((*TABLES, ".npy", ".pcd", *SUFFIXES))
+        raise FileError(f"{path}: expected a file of a cloud ({known}), got suffix {suffix!r}.")
     return read_anyhow(path).points, _vertex_normals(path) if normals else None, []
 
 

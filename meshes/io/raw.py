@@ -93,8 +93,7 @@ def read_anyhow(path: str | Path) -> RawMesh:
         found = read_apart(path)
         return RawMesh(found.points, found.cells)
     if suffix not in _OWN:
-        known = ", ".join((*_OWN, *READERS))
-        raise FileError(f"{path}: expected a mesh file ({known}), got suffix {suffix!r}.")
+        raise FileError(f"{path}: expected a mesh file ({', '.join(SUFFIXES)}), got suffix {suffix!r}.")
     try:
         points, cells = _OWN[suffix](path)
     except (ValueError, KeyError, IndexError, OverflowError, MemoryError) as error:
@@ -122,6 +121,7 @@ FARTHEST = 1e12  # of any unit: beyond, squares of distances are no numbers of u
 _OWN: Mapping[str, Callable[[Path], tuple[Floats, Any]]] = {
     ".stl": read_stl, ".obj": read_obj, ".msh": _any_msh, ".ply": read_ply,
 }  # fmt: skip
+SUFFIXES = (*_OWN, *READERS)  # of the mesh files that are read
 
 
 def _stated(path: Path, name: str) -> str:

@@ -180,6 +180,13 @@ def test_an_unknown_suffix_is_refused_with_the_known_ones(tmp_path: Path) -> Non
         read_surface(tmp_path / "scan.dcm")
 
 
+def test_what_is_no_cloud_is_told_all_that_are(tmp_path: Path) -> None:
+    np.savez(tmp_path / "cloud.npz", points=np.zeros((5, 3)))
+    known = r"\(\.txt, .*\.npy, .*\.pcd, .*\.ply, .*\)"
+    with pytest.raises(FileError, match=rf"expected a file of a cloud {known}, got suffix '\.npz'"):
+        read_cloud(tmp_path / "cloud.npz")
+
+
 # An OBJ counts nothing in advance: cut off among its triangles it is an open surface, which solidify refuses.
 @pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtk", ".vtu", ".vtp", ".msh"])
 @pytest.mark.parametrize("kept", [0.3, 0.8])
