@@ -7,14 +7,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
-from scipy.special import polygamma
 
 from softtwin.meshes.clouds import CloudError
 
-from .loss import robust_deviation
-from .policy import ACCURACY, POLICY
-from .thinning import thinned
+from .thinning import is_among_others, thinned
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -95,20 +91,9 @@ class Cloud:
 
     @cached_property
     def gathered(self) -> Cloud:
-        """Without points that lie by themselves, which are hardly of a surface; the same where there are none.
-
-        What Rusu et al. (Robotics and Autonomous Systems 56 (2008)) do with the mean and the deviation of distances to
-        neighbours, with figures that outliers do not spoil: where points lie anywhere on a surface, the area up to the
-        k-th neighbour has a gamma law of order k. Places that are seen less densely than most may be left out, too.
-        """
-        near = ACCURACY.neighbours
-        if len(self) <= near:
-            return self
-        far = np.log(np.maximum(cKDTree(self.points).query(self.points, near + 1)[0][:, -1], np.finfo(float).tiny))
-        middle = np.median(far)
-        deviation = max(robust_deviation(far - middle), 0.5 * float(polygamma(1, near)) ** 0.5)
-        is_alone = far > middle + POLICY.deviations * deviation
-        return self._of(np.flatnonzero(~is_alone)) if is_alone.any() else self
+        """Without points that lie by themselves, which are hardly of a surface; the same where there are none."""
+        is_among = is_among_others(self.points)
+        return self if is_among.all() else self._of(np.flatnonzero(is_among))
 
     def _of(self, kept: Ints) -> Cloud:
         """Some of the points, by their numbers."""

@@ -1,12 +1,14 @@
-"""Large clouds brought down to the points that carry information, dense places and thin ones alike."""
+"""Large clouds brought down to the points that carry information, dense places and thin ones alike; lone points."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import polygamma
 
-from .policy import ACCURACY
+from .loss import robust_deviation
+from .policy import ACCURACY, POLICY
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -43,3 +45,21 @@ def thinned(cloud: Floats, maximum: int) -> Ints:
     ends = np.cumsum(shares[order])
     landmarks = (chance.uniform() + np.arange(maximum)) * ends[-1] / maximum
     return np.unique(some[order[np.searchsorted(ends, landmarks)]])
+
+
+def is_among_others(cloud: Floats) -> NDArray[np.bool_]:
+    """False of points that lie by themselves, (p,); a cloud of as few points as would be looked at has none.
+
+    What Rusu et al. (Robotics and Autonomous Systems 56 (2008)) do with the mean and the deviation of distances to
+    neighbours, with figures that outliers do not spoil: where points lie anywhere on a surface, the area up to the k-th
+    neighbour has a gamma law of order k. Places that are seen far less densely than most may be taken for such, too.
+
+    Args:
+        cloud: points, (p, 3), metres.
+    """
+    near = ACCURACY.neighbours
+    if len(cloud) <= near:
+        return np.ones(len(cloud), dtype=bool)
+    far = np.log(np.maximum(cKDTree(cloud).query(cloud, near + 1)[0][:, -1], np.finfo(float).tiny))
+    deviation = max(robust_deviation(far - np.median(far)), 0.5 * float(polygamma(1, near)) ** 0.5)
+    return np.asarray(far <= np.median(far) + POLICY.deviations * deviation)

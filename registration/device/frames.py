@@ -22,6 +22,7 @@ from torch import Tensor
 from softtwin.surrogate.precision import without_tf32
 
 from ..policy import ACCURACY, POLICY
+from ..thinning import is_among_others
 from .arrays import DeviceArrays, Start
 from .conclusion import Concluded, Conclusion
 from .evidence import NOISE
@@ -144,21 +145,28 @@ class DeviceFrames:
             self._clouds.copy_(points)
             self._is_point.copy_(is_point)
             self._moved.copy_(torch.from_numpy(begin.moved))
-            iterations = self._from_rest(begin) if start is None else self._descend(begin, is_near=True)
+            iterations = self._from_rest(begin, clouds) if start is None else self._descend(begin, is_near=True)
             found: Concluded = self._run("conclude", self._conclude)
             return self._told(found, iterations)
 
     # ------------------------------------------------------------------ the search
 
-    def _from_rest(self, start: Start) -> int:
-        """With few directions of force, then with all; the model's error is reckoned with the movement found so far."""
-        iterations = 0
+    def _from_rest(self, start: Start, clouds: Sequence[ArrayLike]) -> int:
+        """With few directions of force, then with all; the model's error is reckoned with the movement found so far.
+
+        Points that lie by themselves count at the end alone: see `strategies.cold_start`.
+        """
+        is_point, iterations = self._is_point.clone(), 0
+        for place, cloud in enumerate(clouds):
+            is_among = is_among_others(np.asarray(cloud, dtype=np.float64))
+            self._is_point[place, : len(is_among)] = torch.from_numpy(is_among).to(self._is_point.device)
         for count in (min(ACCURACY.leading, self.arrays.linear.shape[1]), None):
             self._operations.believe(count)
             iterations += self._descend(start, is_near=False)
             local = self._search.local
             self._moved.copy_(self._operations.movement(local.at, local, self._is_point, self._moved))
             start = Start(*map(_host, (local.at, local.eta, self._moved)))
+        self._is_point.copy_(is_point)
         return iterations + self._descend(start, is_near=True)
 
     def _descend(self, start: Start, is_near: bool) -> int:

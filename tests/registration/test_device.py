@@ -354,9 +354,10 @@ def test_outliers_pull_nothing(body: Body) -> None:
     made, truths, clouds = batch_of(body, 1)
     rng = np.random.default_rng(0)
     off = rng.uniform(body.points.min(axis=0) - 0.05, body.points.max(axis=0) + 0.05, (60, 3))
-    arrays = arrays_of(made.setup, made.register(clouds[0]))
-    found = DeviceFrames(arrays, 1, 400).register([np.vstack([clouds[0], off])])
-    assert 0.08 < found.outliers[0] < 0.2
+    arrays, cloud = arrays_of(made.setup, made.register(clouds[0])), np.vstack([clouds[0], off])
+    found, other = DeviceFrames(arrays, 1, 400).register([cloud]), made.register(cloud)
+    assert 0.08 < found.outliers[0] < 0.2  # those that the search began without, too
+    assert found.outliers[0] == pytest.approx(other.outliers, abs=0.02)
     missed = np.linalg.norm(found.displacement[0] - truths[0], axis=1)
     assert np.mean(missed <= found.margin[0] + 1e-12) > 0.8
 
