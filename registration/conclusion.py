@@ -21,7 +21,8 @@ def conclude(setup: Setup, ended: Ended, modulus_deviation: float, seconds: floa
     problem, evaluation, posterior = found.local.problem, found.evaluation, found.posterior
     nodal = problem.nodal_forces(evaluation)
     total = nodal.sum(axis=0)
-    covariance = posterior.net_force_covariance(problem.net_forces(evaluation), prepared.forces.left_out)
+    left_out = evaluation.stiffness_scaling**2 * prepared.forces.left_out
+    covariance = posterior.net_force_covariance(problem.net_forces(evaluation), left_out)
     covariance += modulus_deviation**2 * total[:, None] * total
     state = evaluation.state.full
     pose, pose_correction = _told_in(setup, evaluation.pose or Pose.identity())

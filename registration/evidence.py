@@ -137,14 +137,15 @@ class Hyperprior:
 
     def bend_at(self, eta: Floats) -> Floats:
         """The same below the medians, too."""
-        return 1.0 / self._spread_at(eta) ** 2
+        return 1.0 / self.spread_at(eta) ** 2
 
-    def _spread_at(self, eta: Floats) -> Floats:
+    def spread_at(self, eta: Floats) -> Floats:
+        """Standard deviations on the side of the medians where the logarithms are, (h,); 1 of what is known."""
         return np.where(self.spread > 0.0, np.where(eta < self.median, self.below, self.spread), 1.0)
 
     def cost(self, eta: Floats) -> tuple[float, Floats]:
         """Minus the logarithm of the density, and its gradient."""
-        spread = self._spread_at(eta)
+        spread = self.spread_at(eta)
         scaled = np.where(self.spread > 0.0, eta - self.median, 0.0) / spread
         return 0.5 * float(scaled @ scaled), scaled / spread
 
@@ -352,7 +353,7 @@ class Evidence:
         covariance = np.zeros((len(eta), len(eta)))
         if not len(places):
             return covariance
-        spread = hyperprior.spread[places]
+        spread = hyperprior.spread_at(eta)[places]
         curvature = self.curvature(eta, places) * spread[:, None] * spread
         values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
         root = spread[:, None] * vectors / np.sqrt(np.maximum(values, 1.0))  # in no direction wider than was believed

@@ -192,19 +192,6 @@ class GaussNewton:
         """
         return replace(self, is_shared=found.has_shared_noise)
 
-    def has_settled(self, problem: Problem, evaluation: Evaluation, noise: float, eta: Floats | None = None) -> bool:
-        """Whether no step would be taken from a trial.
-
-        Args:
-            problem: what is registered.
-            evaluation: where.
-            noise: standard deviation of a point's distance as far as it is known, metres.
-            eta: logarithms of the hyperparameters near there, where they are known.
-        """
-        starts = [] if eta is None else [eta]
-        local = LocalModel(problem, evaluation, self.losses[-1], noise, self.graduation, starts=starts)
-        return local.length < self.settled and not local.is_graduated
-
 
 class _Search:
     """One run of the solver: where it is, how far it may step, what it has seen."""

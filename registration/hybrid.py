@@ -15,6 +15,7 @@ from .forward import ForwardModel
 from .registrar import Registrar
 from .residuals.term import ResidualTerm
 from .result import Registration, badness
+from .strategies.refinement import is_same_place
 from .surface_distance import SurfaceDistance
 from .verdict import Verdict
 
@@ -82,10 +83,11 @@ class HybridRegistrar:
     def _best(self, cloud: ArrayLike, draft: Registration, last: Registration | None) -> Registration:
         """The exact model's result, from the frame before, the draft or rest; where time was over before, the best."""
         refined = None
-        for start in [None] if last is None else [last, None]:
+        for start in [last, None] if is_same_place(last, draft) else [None]:
             if draft.judgement.is_usable and not self._is_late:
                 with suppress(NotConverged):
-                    refined = self.exact.refine(cloud, draft, self.fast.model, start)
+                    again = self.exact.refine(cloud, draft, self.fast.model, start)
+                    refined = again if refined is None else min(refined, again, key=badness)
             if refined is not None and refined.judgement.verdict is Verdict.ACCEPTED:
                 return refined
         if not self._is_late:

@@ -197,11 +197,6 @@ class Problem(ParameterStack):
             [block.vjp(evaluation, evaluation.coefficients[part], slopes, cotangent) for block, part in self.parts]
         )
 
-    def normals(self, evaluation: Evaluation) -> Floats:
-        """Of the surface at the points, (p, 3), on the cloud's axes."""
-        directions = evaluation.match.directions
-        return directions if evaluation.pose is None else directions @ evaluation.pose.rotation.T
-
     # ------------------------------------------------------------------ steps, forces
 
     def moved(self, evaluation: Evaluation, change: Floats) -> Floats:

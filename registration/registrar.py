@@ -181,7 +181,7 @@ class Registrar:
             CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
             NotConverged: the model found no state at the start.
         """
-        return self.asked(cloud, self._registered(cloud, start))
+        return self.asked(cloud, self._registered(cloud, start)[0])
 
     def track(self, cloud: ArrayLike, last: Registration) -> Registration:
         """The next frame of a sequence from the last one alone, with forces in the zone alone; see `Tracker`.
@@ -232,13 +232,13 @@ class Registrar:
         if last is None:
             return self.register(cloud)
         try:
-            warm = self.register(cloud, last)
+            found, has_searched = self._registered(cloud, last)
         except NotConverged:
             return self.register(cloud)
-        began_anew = warm.prepared is not last.prepared
-        if warm.judgement.verdict is Verdict.ACCEPTED or began_anew or self.setup.is_late:
-            return warm
-        return min(warm, self.register(cloud), key=badness)
+        found = self.asked(cloud, found)
+        if found.judgement.verdict is Verdict.ACCEPTED or has_searched or self.setup.is_late:
+            return found
+        return min(found, self.register(cloud), key=badness)
 
     def refine(
         self, cloud: ArrayLike, draft: Registration, fast: ForwardModel, last: Registration | None = None
@@ -287,19 +287,20 @@ class Registrar:
                 return found.with_check(compared(found, other))
         return found
 
-    def _registered(self, cloud: ArrayLike, start: Registration | None) -> Registration:
+    def _registered(self, cloud: ArrayLike, start: Registration | None) -> tuple[Registration, bool]:
+        """The result, and whether it was searched for from rest."""
         begin, setup = time.perf_counter(), self.setup
         points = setup.checked(cloud)
         if start is None:
-            return self._cold(points, begin)
+            return self._cold(points, begin), True
         result = self._concluded(track(setup, points, start), begin)
         if has_left(setup, result, start) and not setup.is_late:
             now = time.monotonic()
             hurried = self.limited(now + ACCURACY.searching * (setup.options.solver.until - now))
             other = hurried._cold(points, begin, result)
             best = other if other is result else min(other, result, key=badness)
-            return replace(best, seconds=time.perf_counter() - begin)
-        return result
+            return replace(best, seconds=time.perf_counter() - begin), True
+        return result, False
 
     def _cold(self, points: Cloud, begin: float, known: Registration | None = None) -> Registration:
         """From rest; once more, from fewer directions, where neighbours share more noise than each point has alone.

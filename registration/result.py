@@ -257,7 +257,8 @@ class Registration:
         modulus = float(np.mean(inputs.inputs(self.coefficients[problem.input_part]).parameters["young_modulus"]))
         slopes = problem.net_forces(self.evaluation) / modulus
         slopes[:, place] -= deviation * self.net_force / modulus
-        covariance = self.posterior.net_force_covariance(slopes, problem.forces.left_out / modulus**2)
+        left_out = (self.evaluation.stiffness_scaling / modulus) ** 2 * problem.forces.left_out
+        covariance = self.posterior.net_force_covariance(slopes, left_out)
         return self.net_force / modulus, np.sqrt(np.diag(covariance))
 
     @property

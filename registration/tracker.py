@@ -88,7 +88,7 @@ class Tracker:
     | FOLLOWING | is tracked | that | FOLLOWING |
     | FOLLOWING | is lost; nothing runs in the background | the better of that and of a search from rest | FOLLOWING |
     | FOLLOWING | is lost; a search from rest begins beside the frames | what was tracked, doubtful | SEARCHING |
-    | FOLLOWING | the model finds no state from the last | from rest | FOLLOWING where that is usable, else LOST |
+    | FOLLOWING, SEARCHING | the model finds no state from the last | from rest | FOLLOWING |
     | SEARCHING | comes before the search ends | what is tracked, doubtful | SEARCHING |
     | SEARCHING | comes after the search has found better | tracked from there | FOLLOWING |
     | SEARCHING | comes after the search has not | what is tracked | FOLLOWING |
@@ -149,6 +149,7 @@ class Tracker:
         try:
             found = ways.track(cloud, self._last)
         except NotConverged:
+            self._search = self._newest = None  # what is being searched for is of a cloud before this one
             return self._kept(ways.follow(cloud, None))
         self._newest = _Tracked(cloud, ways, found)
         if self._search is None and ways.is_lost(found, self._last):
@@ -162,9 +163,9 @@ class Tracker:
     def _inquire(self, tracked: _Tracked) -> None:
         """Ask beside the frames whether forces elsewhere explain what one leaves, and take the answer to the last."""
         if self._inquiry is not None and self._inquiry.done():
-            checks = self._inquiry.result().judgement.checks
+            inquiry, self._inquiry = self._inquiry, None
+            checks = inquiry.result().judgement.checks
             self._elsewhere = next((check for check in checks if check.code is Code.FORCES_ELSEWHERE), None)
-            self._inquiry = None
         if not tracked.ways.is_missed(tracked.tracked):
             self._elsewhere = None
         elif self._inquiry is None:

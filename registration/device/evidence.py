@@ -93,9 +93,13 @@ class Hyperpriors(NamedTuple):
         """Of the unknowns, (b, k)."""
         return eta @ self.slopes + self.logs
 
+    def spread_at(self, eta: Tensor) -> Tensor:
+        """Standard deviations on the side of the medians where the logarithms are, (b, 3); 1 of what is known."""
+        return torch.where(self.spread > 0.0, torch.where(eta < self.median, self.below, self.spread), 1.0)
+
     def cost(self, eta: Tensor) -> tuple[Tensor, Tensor]:
         """Slope and bend of minus the logarithm of what is believed, (b, 3) each."""
-        spread = torch.where(self.spread > 0.0, torch.where(eta < self.median, self.below, self.spread), 1.0)
+        spread = self.spread_at(eta)
         off = torch.where(self.spread > 0.0, eta - self.median, 0.0)
         return off / spread.square(), spread.square().reciprocal()
 
@@ -196,7 +200,7 @@ def scale_covariance(sums: Sums, priors: Hyperpriors, eta: Tensor) -> Tensor:
         bends.append((ends[0] - ends[1]) / (2.0 * _STEP))
     curvature = torch.stack(bends, dim=2)
     is_inside = (eta > priors.lowest + _AT_BOUND) & (eta < priors.highest - _AT_BOUND) & (priors.spread > 0.0)
-    spread = torch.where(is_inside, priors.spread, 0.0)
+    spread = torch.where(is_inside, priors.spread_at(eta), 0.0)
     scaled = 0.5 * (curvature + curvature.mT) * spread[:, :, None] * spread[:, None]
     unit = torch.diag_embed(torch.where(is_inside, 0.0, 1.0).to(eta))
     values, vectors = eigen(scaled + unit)

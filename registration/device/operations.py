@@ -341,8 +341,9 @@ class Operations:
         if self.prior is None:
             return shift
         turn, along = (self.prior.deviations * change[:, self.pose])[:, None].split(3, dim=2)
-        arms = self.rest[self.watched] - (self.prior.pivot - self.prior.translation) @ self.prior.rotation
-        return shift + torch.linalg.cross(turn.expand(-1, len(arms), -1), arms.expand(len(turn), -1, -1)) + along
+        arms = self.rest[self.watched] @ self.prior.rotation.T + self.prior.translation - self.prior.pivot
+        seen = torch.linalg.cross(turn.expand(-1, len(arms), -1), arms.expand(len(turn), -1, -1)) + along
+        return shift + seen @ self.prior.rotation
 
 
 def _summed(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:

@@ -46,6 +46,7 @@ class NodalForces(ParameterBlock):
         left_out: covariance of the net force of directions that were left out, for unit scale, (3, 3).
         every: the patterns before any direction was left out, (3a, m); None where none was.
         kept: orthonormal combinations of these that are left, (m, k); None as above.
+        parts: of its size before that each component of the patterns has since, (3a,); None for all of it.
     """
 
     has_own_figures: ClassVar[bool] = True
@@ -57,6 +58,7 @@ class NodalForces(ParameterBlock):
     left_out: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     every: Floats | None = None
     kept: Floats | None = None
+    parts: Floats | None = None
 
     @property
     def size(self) -> int:
@@ -106,7 +108,8 @@ class NodalForces(ParameterBlock):
         """Forces at all nodes of the directions that were left out, (3n, m), dimensionless; None where none was."""
         if self.every is None or self.kept is None:
             return None
-        return self._at_all(self.every - (self.every @ self.kept) @ self.kept.T)
+        unseen = self.every - (self.every @ self.kept) @ self.kept.T
+        return self._at_all(unseen if self.parts is None else self.parts[:, None] * unseen)
 
     def forces(self, coefficients: Floats) -> Floats:
         """Nodal forces, (n, 3), newtons."""
@@ -306,7 +309,8 @@ def localised(forces: NodalForces, where: Floats) -> NodalForces:
     patterns = parts[:, None] * forces.patterns
     every = forces.patterns if forces.every is None else forces.every
     whole, kept = _parted_net(parts, every), _net(patterns)
-    return replace(forces, patterns=patterns, left_out=whole @ whole.T - kept @ kept.T, every=None, kept=None)
+    left_out = whole @ whole.T - kept @ kept.T
+    return replace(forces, patterns=patterns, left_out=left_out, parts=None if forces.every is None else parts)
 
 
 def _parted_net(parts: Floats, patterns: Floats) -> Floats:

@@ -84,10 +84,11 @@ class PosePrior(ParameterBlock):
         return found
 
     def moved(self, at: Evaluation, change: Floats, every: int) -> Floats:
-        """See `ParameterBlock.moved`: the observed side, as the camera sees it."""
+        """See `ParameterBlock.moved`: the observed side as the camera sees it, on the body's axes."""
         twist = self.deviations * change
-        arm = at.observed.body.points[at.observed.nodes[::every]] - self.centre
-        return np.cross(twist[:3], arm) + twist[3:]
+        arm = (at.observed.body.points[at.observed.nodes[::every]] - self.centre) @ at.rotation.T
+        found: Floats = (np.cross(twist[:3], arm) + twist[3:]) @ at.rotation
+        return found
 
     def checks(self, found: BlockPosterior, expected: Expectations) -> Iterator[Check]:
         """Whether the pose lies where it was expected."""

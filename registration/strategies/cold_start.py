@@ -46,9 +46,9 @@ def localise(setup: Setup, points: Cloud, leading: int | None = None) -> Localis
         leading: directions of force to begin with; those of the options if not given.
     """
     prepared, rule, solver = setup.unlocalised, setup.options.localisation, setup.options.solver
-    points = points.gathered
     if rule.rounds == 0:
         return Localised(prepared, begin(setup, points, prepared, solver.unsettled(), leading), False)
+    points = points.gathered
     few = points.thinned(rule.points)
     found = _from_rest(setup, few, prepared, solver, leading)
     for left in reversed(range(rule.rounds)):
@@ -127,14 +127,17 @@ def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
     prepared, found, solver = begun.prepared, begun.found, setup.options.solver
     if setup.is_hopeless(found):
         solver = solver.without_steps()
-    elif points.gathered is not points:  # those that had to wait are told by how far off they are
-        solver = solver.directly()
+    gathered = points.gathered
     if setup.error is None:
-        if not begun.is_settled or len(found.evaluation.cloud) < len(points):
-            found = _from(setup.plain(points, prepared), solver, found)
-        return Ended(prepared, found)
-    problem = setup.problem(points, prepared, found.evaluation.positions, found.rms_distance)
-    found = _from(problem.unshared, solver.unsettled(), found)
+        if not begun.is_settled or len(found.evaluation.cloud) < len(gathered):
+            found = _from(setup.plain(gathered, prepared), solver, found)
+        if gathered is points or len(found.evaluation.cloud) == len(points):
+            return Ended(prepared, found)
+        return Ended(prepared, _from(setup.plain(points, prepared), solver.directly(), found))
+    problem, few = (
+        setup.problem(each, prepared, found.evaluation.positions, found.rms_distance) for each in (points, gathered)
+    )
+    found = _from(few.unshared, solver.unsettled(), found)
     if found.outcome is Outcome.CONVERGED:  # the convex loss has nothing left to do
         solver = solver.directly()
     return Ended(prepared, _from(problem, solver, found))

@@ -26,8 +26,7 @@ def refine(
             place.
     """
     solver = setup.options.solver.following().going_on(draft.solved)
-    is_same_place = last is not None and last.draft is not None and last.draft.prepared is draft.prepared
-    if last is not None and is_same_place and last.prepared is not draft.prepared:  # else it is the draft itself
+    if last is not None and is_same_place(last, draft):
         problem = setup.problem(points, last.prepared, last.evaluation.positions, last.rms_distance)
         near = replace(last.evaluation, coefficients=problem.carried(last.evaluation.coefficients, last.problem))
         return Ended(last.prepared, solved_with(setup, problem, near, solver, last.eta))
@@ -40,3 +39,15 @@ def refine(
     start[problem.force_part] = prepared.forces.nearest(draft.unknown_forces)
     found = solved_with(setup, problem, problem.evaluation(start, draft.evaluation), solver, draft.eta, fast)
     return finish(setup, points, Localised(prepared, found))
+
+
+def is_same_place(last: Registration | None, draft: Registration) -> bool:
+    """Whether an exact model's last result has forces where a draft seeks them, so that it can be gone on from.
+
+    Args:
+        last: of the frame before; None for none.
+        draft: the faster model's result.
+    """
+    if last is None or last.draft is None or last.prepared is draft.prepared:  # the last: it is a draft itself
+        return False
+    return last.draft.prepared is draft.prepared
