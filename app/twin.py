@@ -349,7 +349,8 @@ class Twin:
 
         Raises:
             ConfigError: no such zone; landmarks beside a contact of unknown place.
-            CloudError: a cloud that is empty, holds NaN, lies too far from the body, or shows no one pose.
+            CloudError: a cloud without one point of finite coordinates, one that lies too far from the body, or one
+                that shows no one pose.
             NotConverged: the model found no state at the start.
             ValueError: landmarks that do not lie on the observed side, or of other shapes.
         """

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softtwin.meshes.clouds import CloudError
 
-from .thinning import is_among_others, thinned
+from .thinning import is_isolated, thinned
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -90,10 +90,10 @@ class Cloud:
         return self._of(np.setdiff1d(np.arange(len(self)), order[1:][is_again]))
 
     @cached_property
-    def gathered(self) -> Cloud:
+    def without_isolated(self) -> Cloud:
         """Without points that lie by themselves, which are hardly of a surface; the same where there are none."""
-        is_among = is_among_others(self.points)
-        return self if is_among.all() else self._of(np.flatnonzero(is_among))
+        isolated = is_isolated(self.points)
+        return self._of(np.flatnonzero(~isolated)) if isolated.any() else self
 
     def _of(self, kept: Ints) -> Cloud:
         """Some of the points, by their numbers."""

@@ -26,7 +26,7 @@ class Outcome(Enum):
 
 
 _ADVICE = {
-    Outcome.CONVERGED: "nothing: a further step would move less than a fifth of what is uncertain.",
+    Outcome.CONVERGED: "nothing: a further step would change less than is uncertain by far.",
     Outcome.NO_DESCENT: "start from another frame's result or a better pose; look whether cloud and organ match.",
     Outcome.NO_STATE: "the forces that the cloud asks for leave what the model can solve: check pose and stiffness.",
     Outcome.MAXIMUM_ITERATIONS: "raise max_iterations, or start from the result of this frame.",

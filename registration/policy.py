@@ -1,9 +1,9 @@
 """Numbers of the registration that are choices: what each means, where it comes from, in three tables.
 
 Answers depend on those of `POLICY`: who changes one runs `benchmarks/guards.py` before and after. Those of `ACCURACY`
-say how closely something is computed, or how much of it is looked at: with more of it answers stay what they were, and
-time changes. `benchmarks/policy.py` says of each of these what happens at half and at twice its value. `RIGID` has
-those of the search for a pose that nobody gave, which `benchmarks/alignment.py` measures as a whole.
+say how closely something is computed, or how much of it is looked at: with more of it time changes more than answers
+do. `benchmarks/policy.py` says of each of these what happens at half and at twice its value. `RIGID` has those of the
+search for a pose that nobody gave, which `benchmarks/alignment.py` measures as a whole.
 Constants of the literature (Huber's 1.345, the rules of a trust region) stand where they are used, with their source.
 """
 
@@ -181,7 +181,7 @@ class Policy:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How closely, or how much of it: with more, answers stay what they were, and time changes."""
+    """How closely, or how much of it: with more, time changes more than answers do; the table says how much."""
 
     settled: float = choice(
         0.1, "posterior deviations a coefficient", "the search has ended where so much is left after one more step"

@@ -1,4 +1,4 @@
-"""What is known of the coefficients after the cloud: Laplace's approximation at a state, in its own eigenvectors."""
+"""What is known of the coefficients after the cloud: Laplace's approximation at a state."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Posterior:
     Args:
         mean: (k,).
         covariance: (k, k).
-        scales: noise and force scale that it was taken with.
+        scales: the hyperparameters that it was taken with.
         informed: directions that the cloud tells more of than the prior did (the sum of their shares).
         force: standard deviation of a coefficient of force of which the cloud tells nothing, newtons: the root of the
             mean square of the forces' scale.

@@ -178,7 +178,7 @@ class Registrar:
             start: an earlier frame's result to start from; no force if not given.
 
         Raises:
-            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+            CloudError: a cloud without one point of finite coordinates, or one that lies too far from the body.
             NotConverged: the model found no state at the start.
         """
         return self.asked(cloud, self._registered(cloud, start)[0])
@@ -226,7 +226,7 @@ class Registrar:
             last: the last usable result; None for the first frame.
 
         Raises:
-            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+            CloudError: a cloud without one point of finite coordinates, or one that lies too far from the body.
             NotConverged: the model found no state at rest.
         """
         if last is None:
@@ -418,7 +418,7 @@ def register_sequence(registrar: Registrar, clouds: Iterable[ArrayLike]) -> Iter
         clouds: one cloud a frame, (p, 3), metres.
 
     Raises:
-        CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+        CloudError: a cloud without one point of finite coordinates, or one that lies too far from the body.
     """
     tracker = Tracker()
     for cloud in clouds:

@@ -176,7 +176,7 @@ class Registration:
 
     @property
     def informed(self) -> float:
-        """Number of likelihood-informed directions of force and pose."""
+        """Number of likelihood-informed directions of all that is unknown: forces, pose, inputs, error patterns."""
         return self.posterior.informed
 
     @property

@@ -154,7 +154,7 @@ class Setup:
         """A cloud's points, thinned.
 
         Raises:
-            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+            CloudError: a cloud without one point of finite coordinates, or one that lies too far from the body.
         """
         given = Cloud.of(cloud)
         if given.is_finite:

@@ -1,4 +1,4 @@
-"""Large clouds brought down to the points that carry information, dense places and thin ones alike; lone points."""
+"""Large clouds brought down to the points that carry information, dense places and thin ones alike; isolated points."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def thinned(cloud: Floats, maximum: int) -> Ints:
     return np.unique(some[order[np.searchsorted(ends, landmarks)]])
 
 
-def is_among_others(cloud: Floats) -> NDArray[np.bool_]:
-    """False of points that lie by themselves, (p,); a cloud of as few points as would be looked at has none.
+def is_isolated(cloud: Floats) -> NDArray[np.bool_]:
+    """Which points lie by themselves, (p,); of no more points than neighbours are counted none does.
 
     What Rusu et al. (Robotics and Autonomous Systems 56 (2008)) do with the mean and the deviation of distances to
     neighbours, with figures that outliers do not spoil: where points lie anywhere on a surface, the area up to the k-th
@@ -59,7 +59,7 @@ def is_among_others(cloud: Floats) -> NDArray[np.bool_]:
     """
     near = ACCURACY.neighbours
     if len(cloud) <= near:
-        return np.ones(len(cloud), dtype=bool)
+        return np.zeros(len(cloud), dtype=bool)
     far = np.log(np.maximum(cKDTree(cloud).query(cloud, near + 1)[0][:, -1], np.finfo(float).tiny))
     deviation = max(robust_deviation(far - np.median(far)), 0.5 * float(polygamma(1, near)) ** 0.5)
-    return np.asarray(far <= np.median(far) + POLICY.deviations * deviation)
+    return np.asarray(far > np.median(far) + POLICY.deviations * deviation)

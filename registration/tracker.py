@@ -133,7 +133,7 @@ class Tracker:
             ways: how it can be registered.
 
         Raises:
-            CloudError: a cloud that is empty, holds NaN, or lies too far from the body.
+            CloudError: a cloud without one point of finite coordinates, or one that lies too far from the body.
             NotConverged: the model found no state at rest.
         """
         self._is_between.clear()

@@ -96,7 +96,8 @@ class Judgement:
 
     Args:
         verdict: the worst of what was found.
-        reasons: one sentence each, the gravest first; none where it is accepted.
+        reasons: one sentence each, the gravest first, but for those of checks that were added later; none where it
+            is accepted.
         checks: all that were made, passed ones too; none where nothing was registered.
     """
 

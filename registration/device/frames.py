@@ -22,7 +22,7 @@ from torch import Tensor
 from softtwin.surrogate.precision import without_tf32
 
 from ..policy import ACCURACY, POLICY
-from ..thinning import is_among_others
+from ..thinning import is_isolated
 from .arrays import DeviceArrays, Start
 from .conclusion import Concluded, Conclusion
 from .evidence import NOISE
@@ -158,8 +158,8 @@ class DeviceFrames:
         """
         is_point, iterations = self._is_point.clone(), 0
         for place, cloud in enumerate(clouds):
-            is_among = is_among_others(np.asarray(cloud, dtype=np.float64))
-            self._is_point[place, : len(is_among)] = torch.from_numpy(is_among).to(self._is_point.device)
+            is_kept = torch.from_numpy(~is_isolated(np.asarray(cloud, dtype=np.float64)))
+            self._is_point[place, : len(is_kept)] = is_kept.to(self._is_point.device)
         for count in (min(ACCURACY.leading, self.arrays.linear.shape[1]), None):
             self._operations.believe(count)
             iterations += self._descend(start, is_near=False)

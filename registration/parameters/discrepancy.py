@@ -31,8 +31,8 @@ _SMOOTHNESS = 1.5  # of what the patterns leave out, as of all fields: once diff
 class ModelError(FieldBlock):
     """Patterns of what the forward model may get wrong, of unit variance (Kennedy and O'Hagan 2001).
 
-    The amplitude is the largest displacement that is reckoned with, metres. `rest` is the block of what the patterns
-    leave out.
+    The amplitude is the largest displacement that is reckoned with, metres. `remainder` is the block of what the
+    patterns leave out.
 
     Args:
         discrepancy: of the model, for a largest displacement of one metre.

@@ -36,7 +36,7 @@ class YoungModulus(InputBlock):
     name: str = ""
 
     def __post_init__(self) -> None:
-        check_deviation("Stiffness", self.deviation)
+        check_deviation("YoungModulus", self.deviation)
 
     @property
     def needs(self) -> tuple[str, ...]:

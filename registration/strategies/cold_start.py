@@ -48,7 +48,7 @@ def localise(setup: Setup, points: Cloud, leading: int | None = None) -> Localis
     prepared, rule, solver = setup.unlocalised, setup.options.localisation, setup.options.solver
     if rule.rounds == 0:
         return Localised(prepared, begin(setup, points, prepared, solver.unsettled(), leading), False)
-    points = points.gathered
+    points = points.without_isolated
     few = points.thinned(rule.points)
     found = _from_rest(setup, few, prepared, solver, leading)
     for left in reversed(range(rule.rounds)):
@@ -76,7 +76,7 @@ def begin(
         solver: that ends it, where the model's error is not known in patterns.
         leading: as for `localise`.
     """
-    points = points.gathered
+    points = points.without_isolated
     begun = _led(setup, points, prepared, leading)
     if setup.error is not None and not setup.is_hopeless(begun):
         return begun
@@ -109,7 +109,7 @@ def _with_all(
     setup: Setup, points: Cloud, prepared: Prepared, solver: GaussNewton | LBFGS, begun: SolverResult
 ) -> SolverResult:
     """All directions, from where the leading ones have ended."""
-    if setup.is_hopeless(begun):  # what six directions leave as far off is judged by what all would do, to first order
+    if setup.is_hopeless(begun):  # what few directions leave as far off is judged by what all would do, to first order
         solver = solver.without_steps()
     return _from(setup.plain(points, prepared), solver, begun)
 
@@ -127,17 +127,17 @@ def finish(setup: Setup, points: Cloud, begun: Localised) -> Ended:
     prepared, found, solver = begun.prepared, begun.found, setup.options.solver
     if setup.is_hopeless(found):
         solver = solver.without_steps()
-    gathered = points.gathered
+    few = points.without_isolated
     if setup.error is None:
-        if not begun.is_settled or len(found.evaluation.cloud) < len(gathered):
-            found = _from(setup.plain(gathered, prepared), solver, found)
-        if gathered is points or len(found.evaluation.cloud) == len(points):
+        if not begun.is_settled or len(found.evaluation.cloud) < len(few):
+            found = _from(setup.plain(few, prepared), solver, found)
+        if few is points or len(found.evaluation.cloud) == len(points):
             return Ended(prepared, found)
         return Ended(prepared, _from(setup.plain(points, prepared), solver.directly(), found))
-    problem, few = (
-        setup.problem(each, prepared, found.evaluation.positions, found.rms_distance) for each in (points, gathered)
+    problem, first = (
+        setup.problem(each, prepared, found.evaluation.positions, found.rms_distance) for each in (points, few)
     )
-    found = _from(few.unshared, solver.unsettled(), found)
+    found = _from(first.unshared, solver.unsettled(), found)
     if found.outcome is Outcome.CONVERGED:  # the convex loss has nothing left to do
         solver = solver.directly()
     return Ended(prepared, _from(problem, solver, found))

@@ -16,15 +16,17 @@ from softtwin.reference.data.outcome import NotConverged
 from softtwin.registration.gauss_newton import GaussNewton
 from softtwin.registration.hybrid import HybridRegistrar
 from softtwin.registration.hyperparameters import LogNormalPrior
-from softtwin.registration.options import RegistrationOptions
+from softtwin.registration.options import RegistrationOptions, SparseLocalisation
 from softtwin.registration.outcome import Outcome
 from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.parameters.pose import PosePrior
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registrar, register_sequence
 from softtwin.registration.residuals.landmarks import LandmarkPairs
+from softtwin.registration.result import Registration
+from softtwin.registration.strategies.refinement import is_same_place
 from softtwin.registration.surface_distance import SurfaceDistance
-from softtwin.registration.verdict import Verdict
+from softtwin.registration.verdict import Judgement, Verdict
 
 from .conftest import Cantilever, CantileverState, cloud_on, tip_forces
 
@@ -226,3 +228,56 @@ def test_another_pose_keeps_what_pulls_beside_the_cloud(body: Body) -> None:
     pose = PosePrior(Pose.identity(), body.points.mean(axis=0))
     posed = made.with_terms(marks).with_pose(pose)
     assert posed.setup.terms == (marks,) and posed.options is made.options
+
+
+def judged(found: Registration, verdict: Verdict) -> Registration:
+    return replace(found, judgement=Judgement(verdict))
+
+
+def test_of_all_that_the_exact_model_finds_the_best_is_given(
+    body: Body, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the last frame doubtful, from the draft and from rest refused: the first is the answer."""
+    model = Cantilever(body)
+    truths = [model.solve(tip_forces(body, tuple(part * np.array(NET)))).displacement for part in (0.9, 1.0)]
+    clouds = [cloud_on(body, truth, 300, rng, 5e-4) for truth in truths]
+    both = engine(Bent(body), Bent(body))
+    first, starts = both.follow(clouds[0], None), []
+    refine = both.exact.refine
+
+    def refined(cloud: Any, draft: Any, fast: Any, last: Any = None) -> Registration:
+        starts.append(last)
+        return judged(refine(cloud, draft, fast, last), Verdict.REFUSED if last is None else Verdict.DOUBTFUL)
+
+    register = both.exact.register
+    monkeypatch.setattr(both.exact, "refine", refined)
+    monkeypatch.setattr(both.exact, "register", lambda cloud: judged(register(cloud), Verdict.REFUSED))
+    assert both.follow(clouds[1], first).judgement.verdict is Verdict.DOUBTFUL
+    assert starts == [first, None]
+    elsewhere, starts[:] = replace(first, draft=both.fast.register(clouds[0])), []
+    both.follow(clouds[1], elsewhere)
+    assert starts == [None] or starts[0] is elsewhere  # where forces are sought elsewhere, the last frame tells nothing
+    other = replace(first, draft=replace(first, prepared=both.fast.setup.unlocalised))
+    assert not is_same_place(other, first.draft) and not is_same_place(None, first.draft)
+
+
+def test_a_frame_that_is_lost_is_searched_for_from_rest_once(
+    body: Body, truth: np.ndarray, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether forces are gathered or not, and whether the model is the one of the frame before or another."""
+    searched = []
+    cold = Registrar._cold
+    monkeypatch.setattr(Registrar, "_cold", lambda *given: searched.append(1) or cold(*given))
+    forces = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.05, 2.0, minimum=1e-4))
+    good = cloud_on(body, truth, 300, rng, 5e-4)
+    odd = good + 0.03 * np.sin(40.0 * good[:, :1]) * [0.0, 0.0, 1.0]  # waves that no force at the tip makes
+    few = good[:20]  # as near as before, and doubtful
+    for rounds in (0, 2):
+        options = RegistrationOptions(localisation=SparseLocalisation(rounds=rounds))
+        observed = SurfaceDistance(body, body.surfaces["observed"])
+        made = Registrar(Cantilever(body), observed, forces, options)
+        first = made.register(good)
+        for cloud, ways in ((odd, made), (few, made), (few, made.with_model(Cantilever(body)))):
+            searched.clear()
+            assert ways.follow(cloud, first).judgement.verdict is not Verdict.ACCEPTED
+            assert len(searched) == 1

@@ -236,3 +236,19 @@ def test_of_a_result_that_is_kept_one_law_is_kept(rng) -> None:
     np.testing.assert_allclose(law.inverse @ evidence.scaled(found), np.eye(len(law.root)), atol=1e-9)
     change = rng.standard_normal(len(law.root))
     np.testing.assert_allclose(law.square(change), change @ np.linalg.solve(law.covariance, change), rtol=1e-9)
+
+
+def test_below_its_median_a_scale_is_as_uncertain_as_was_believed_there() -> None:
+    """Of data that tell nothing: above the median by the spread there, below it by that below."""
+    nothing = LinearProblem(np.zeros((1, 2, 2)), np.zeros((1, 2)), np.zeros(1), np.zeros(1), np.zeros(1), None)
+    believed = Hyperprior.of([LogNormalPrior(1.0, 0.25, spread_below=1.0)])
+
+    def unmoved(eta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(1), np.zeros((1, 1))
+
+    def unit(eta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(2), np.zeros((1, 2))
+
+    evidence = Evidence(nothing, unmoved, unit, believed)
+    for place, spread in ((0.1, 0.25), (-0.1, 1.0)):
+        np.testing.assert_allclose(evidence.covariance(np.array([place])), [[spread**2]], rtol=1e-6)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -253,3 +254,14 @@ def test_a_mirror_is_never_fitted() -> None:
     mirrored = {name: np.array(place) * [-1, 1, 1] for name, place in MARKS.items()}
     fit = from_landmarks(MARKS, mirrored)
     assert np.linalg.det(fit.pose.rotation) == pytest.approx(1.0) and fit.rms > 0.01
+
+
+def test_what_a_turn_of_the_camera_moves_is_told_on_the_bodys_axes(rng: np.random.Generator) -> None:
+    """With the camera turned by any angle: as far as the camera sees points move, in the body's axes."""
+    mean, points = _pose(rng), rng.standard_normal((40, 3))
+    prior = PosePrior(mean, points.mean(axis=0), 0.1, 0.02)
+    observed = SimpleNamespace(body=SimpleNamespace(points=points), nodes=np.arange(40))
+    at = SimpleNamespace(observed=observed, rotation=mean.rotation)
+    for change in 1e-6 * np.eye(6):
+        seen = prior.pose(change).apply(points) - mean.apply(points)
+        np.testing.assert_allclose(prior.moved(at, change, 1), seen @ mean.rotation, atol=1e-11)  # type: ignore[arg-type]

@@ -252,3 +252,32 @@ def test_a_search_that_nobody_waits_for_ends_with_its_next_step(live: Tracker) -
     live.close()
     assert type(search.exception(10.0)).__name__ == "_Closed" and live.phase is Phase.FOLLOWING
     assert ("search", "") not in ways.taken
+
+
+def test_a_search_for_a_cloud_before_one_that_began_anew_is_forgotten(live: Tracker) -> None:
+    """It was begun from a state that is no longer gone on from, and is held against no cloud since."""
+    ways = searching(live, found("lost", "odd"), found("rest"))
+    search = live._search
+    assert search is not None
+    ways.results |= {"track": NotConverged("none"), "follow": found("anew")}
+    assert live.take(CLOUD, ways).name == "anew" and live.phase is Phase.FOLLOWING  # type: ignore[attr-defined]
+    ways.go.set()
+    assert search.result(10.0) is not None
+    ways.results["track"] = found("next")
+    assert live.take(CLOUD, ways).judgement.verdict is Verdict.ACCEPTED
+    assert ways.taken[-1] == ("track", "anew")
+
+
+def test_a_fault_of_an_inquiry_is_said_once(live: Tracker) -> None:
+    class Faulty(Told):
+        def asked(self, cloud: Any, found: Any) -> Any:
+            raise ZeroDivisionError("a fault")
+
+    ways = Faulty(track=found("tracked"), elsewhere=None)
+    following(live).take(CLOUD, ways)
+    inquiry = live._inquiry
+    assert inquiry is not None
+    inquiry.exception(10.0)
+    with pytest.raises(ZeroDivisionError, match="a fault"):
+        live.take(CLOUD, ways)
+    assert live.take(CLOUD, Told(track=found("next"))).judgement.verdict is Verdict.ACCEPTED
