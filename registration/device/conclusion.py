@@ -51,16 +51,17 @@ class Conclusion:
             moving += range(operations.pose.start, operations.pose.stop)
         self._moving = torch.tensor(moving, device=device)
 
-    def concluded(self, local: Local, is_point: Tensor, moved: Tensor) -> Concluded:
-        """After the last step, too, which is too short for new derivatives.
+    def concluded(self, local: Local, has_settled: Tensor, is_point: Tensor, moved: Tensor) -> Concluded:
+        """After the last step, too, which is too short for new derivatives; where none was, that is not known.
 
         Args:
             local: where the search has ended.
+            has_settled: whether the next step would be such a last one, (b,).
             is_point: of the clouds, (b, p).
             moved: largest displacement that the model's error was reckoned with, (b,), metres.
         """
         by, forces = self._by, self._by.forces
-        c = local.at - (local.inverse @ local.gradient[..., None])[..., 0]
+        c = local.at - has_settled[:, None] * (local.inverse @ local.gradient[..., None])[..., 0]
         values = by.network_at(c)[0]
         displacement = (by.columns(c, values, moved) @ by.whole.T + by.whole_offset).view(len(c), -1, 3)
         slopes = torch.cat(

@@ -75,13 +75,13 @@ class DeviceFrames:
     Args:
         arrays: body, surrogate, unknowns; see `from_registration.arrays_of`.
         batch: clouds at a time.
-        points: most points of a cloud.
+        points: most points of a cloud; as many as `policy.ACCURACY` has if not given.
         device: `cpu` or `cuda`.
         confidence: of the margins.
         execution: of the operations on a GPU: `compiled`, fused by torch.compile (a minute or more at the first call)
             and replayed from CUDA graphs; `graphs`, replayed alone; `eager`, each of some thousand started by itself.
             On a processor always the last.
-        settled: where a search has ended, see `policy.ACCURACY`.
+        settled: where a search has ended; where `policy.ACCURACY` has it if not given.
 
     Raises:
         ValueError: fewer than one cloud, or points than a cloud has to have; another confidence or execution; a GPU
@@ -92,13 +92,15 @@ class DeviceFrames:
         self,
         arrays: DeviceArrays,
         batch: int = 1,
-        points: int = ACCURACY.points,
+        points: int | None = None,
         device: str = "cpu",
         *,
         confidence: float = 0.95,
         execution: Execution = "compiled",
-        settled: float = ACCURACY.settled,
+        settled: float | None = None,
     ) -> None:
+        points = ACCURACY.points if points is None else points
+        settled = ACCURACY.settled if settled is None else settled
         if batch < 1 or points < POLICY.minimum_points:
             raise ValueError(
                 f"DeviceFrames: expected a batch of 1 and {POLICY.minimum_points:.0f} points at least, got {batch} and "
@@ -193,7 +195,7 @@ class DeviceFrames:
         return self._search.has_ended
 
     def _conclude(self) -> Concluded:
-        return self._concluded(self._search.local, self._is_point, self._moved)
+        return self._concluded(self._search.local, self._search.has_settled, self._is_point, self._moved)
 
     def _run(self, name: str, work: Callable[[], Any]) -> Any:
         """Work on memory that stays where it is: captured the first time, and replayed."""

@@ -29,7 +29,7 @@ from softtwin.registration.loss import Tukey
 from softtwin.registration.options import RegistrationOptions, SparseLocalisation
 from softtwin.registration.parameters.nodal_forces import nodal_forces
 from softtwin.registration.parameters.pose import PosePrior
-from softtwin.registration.policy import varied
+from softtwin.registration.policy import ACCURACY, varied
 from softtwin.registration.pose import Pose
 from softtwin.registration.registrar import Registrar
 from softtwin.registration.residuals.landmarks import LandmarkPairs
@@ -360,6 +360,19 @@ def test_outliers_pull_nothing(body: Body) -> None:
     assert found.outliers[0] == pytest.approx(other.outliers, abs=0.02)
     missed = np.linalg.norm(found.displacement[0] - truths[0], axis=1)
     assert np.mean(missed <= found.margin[0] + 1e-12) > 0.8
+
+
+def test_where_a_search_has_not_ended_no_last_step_is_taken(body: Body) -> None:
+    """It would be as long as any, and nobody has looked whether it leads to anything better."""
+    made, _, clouds = batch_of(body, 1)
+    arrays = arrays_of(made.setup, made.register(clouds[0]))
+    with varied("iterations", 0.01):
+        frames = DeviceFrames(arrays, 1, 400)
+        found = frames.register(clouds)
+    assert not found.has_converged[0]
+    np.testing.assert_array_equal(found.start.coefficients, frames._search.local.at.numpy())
+    with varied("points", 0.4):
+        assert DeviceFrames(arrays).points == ACCURACY.points == 400
 
 
 def test_noise_that_neighbours_share_is_named(body: Body) -> None:
