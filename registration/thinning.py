@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.special import polygamma
+from scipy.special import bdtrc, polygamma
 
 from .loss import robust_deviation
 from .policy import ACCURACY, POLICY
@@ -52,7 +52,8 @@ def is_isolated(cloud: Floats) -> NDArray[np.bool_]:
 
     What Rusu et al. (Robotics and Autonomous Systems 56 (2008)) do with the mean and the deviation of distances to
     neighbours, with figures that outliers do not spoil: where points lie anywhere on a surface, the area up to the k-th
-    neighbour has a gamma law of order k. Places that are seen far less densely than most may be taken for such, too.
+    neighbour has a gamma law of order k. Places that are seen far less densely than most may be taken for such, too. So
+    few as chance may put there are none.
 
     Args:
         cloud: points, (p, 3), metres.
@@ -62,4 +63,6 @@ def is_isolated(cloud: Floats) -> NDArray[np.bool_]:
         return np.zeros(len(cloud), dtype=bool)
     far = np.log(np.maximum(cKDTree(cloud).query(cloud, near + 1)[0][:, -1], np.finfo(float).tiny))
     deviation = max(robust_deviation(far - np.median(far)), 0.5 * float(polygamma(1, near)) ** 0.5)
-    return np.asarray(far > np.median(far) + POLICY.deviations * deviation)
+    isolated = far > np.median(far) + POLICY.deviations * deviation
+    by_chance = float(bdtrc(isolated.sum() - 1, len(cloud), 0.5 * POLICY.unlikely)) if isolated.any() else 1.0
+    return np.asarray(isolated & (by_chance < POLICY.unlikely))

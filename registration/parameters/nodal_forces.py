@@ -46,7 +46,6 @@ class NodalForces(ParameterBlock):
         left_out: covariance of the net force of directions that were left out, for unit scale, (3, 3).
         every: the patterns before any direction was left out, (3a, m); None where none was.
         kept: orthonormal combinations of these that are left, (m, k); None as above.
-        parts: of its size before that each component of the patterns has since, (3a,); None for all of it.
     """
 
     has_own_figures: ClassVar[bool] = True
@@ -58,7 +57,6 @@ class NodalForces(ParameterBlock):
     left_out: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     every: Floats | None = None
     kept: Floats | None = None
-    parts: Floats | None = None
 
     @property
     def size(self) -> int:
@@ -108,8 +106,7 @@ class NodalForces(ParameterBlock):
         """Forces at all nodes of the directions that were left out, (3n, m), dimensionless; None where none was."""
         if self.every is None or self.kept is None:
             return None
-        unseen = self.every - (self.every @ self.kept) @ self.kept.T
-        return self._at_all(unseen if self.parts is None else self.parts[:, None] * unseen)
+        return self._at_all(self.every - (self.every @ self.kept) @ self.kept.T)
 
     def forces(self, coefficients: Floats) -> Floats:
         """Nodal forces, (n, 3), newtons."""
@@ -301,6 +298,10 @@ def likelihood_informed(
 def localised(forces: NodalForces, where: Floats) -> NodalForces:
     """The forces where they may act: each node's share of the basis times its part.
 
+    The net force of directions that were left out before stays in doubt. Their displacements do not: of a size that was
+    found from the same cloud they hold too much of the error (robustness, no zone: with them 95 to 99.9 % of the nodes
+    are in margins of 90, without 92 to 96).
+
     Args:
         forces: forces of which nothing is known of their place.
         where: part of its expected size that a force at each node may have, (n,).
@@ -309,8 +310,7 @@ def localised(forces: NodalForces, where: Floats) -> NodalForces:
     patterns = parts[:, None] * forces.patterns
     every = forces.patterns if forces.every is None else forces.every
     whole, kept = _parted_net(parts, every), _net(patterns)
-    left_out = whole @ whole.T - kept @ kept.T
-    return replace(forces, patterns=patterns, left_out=left_out, parts=None if forces.every is None else parts)
+    return replace(forces, patterns=patterns, left_out=whole @ whole.T - kept @ kept.T, every=None, kept=None)
 
 
 def _parted_net(parts: Floats, patterns: Floats) -> Floats:

@@ -283,21 +283,3 @@ def test_windowed_forces_keep_the_variance_of_what_is_left_out(body: Body) -> No
     whole = (np.repeat(where, 3)[:, None] * every.basis).reshape(-1, 3, every.size).sum(axis=0)
     np.testing.assert_allclose(inside.net_basis @ inside.net_basis.T + inside.left_out, whole @ whole.T, atol=1e-9)
     assert inside.size == 2
-
-
-def test_what_was_left_out_before_forces_were_gathered_stays_uncertain(body: Body) -> None:
-    """Its forces have the parts of their size that the others have, in margins as in the net force."""
-    every = nodal_forces(body, body.node_sets["tip"], LogNormalPrior(0.1, 1.0), smoothness=0.1)
-    observed = SurfaceDistance(body, body.surfaces["observed"])
-    few = told_forces(every, observed, LikelihoodInformed(maximum=4))
-    where = np.linspace(0.1, 1.0, len(body.points))
-    parts = np.repeat(where, 3)[:, None]
-    turned = np.linalg.qr(np.vander(np.linspace(0.5, 1.5, few.size)))[0]
-    assert 2 < few.size < every.size
-    inside = localised(few, where).combined(turned[:, :2])
-    assert inside.unseen is not None
-    whole = inside.basis @ inside.basis.T + inside.unseen @ inside.unseen.T
-    wanted = parts * (every.basis @ every.basis.T) * parts.T
-    np.testing.assert_allclose(whole, wanted, atol=1e-9 * np.abs(wanted).max())
-    net = inside.unseen.reshape(-1, 3, inside.unseen.shape[1]).sum(axis=0)
-    np.testing.assert_allclose(net @ net.T, inside.left_out, atol=1e-9)
