@@ -74,6 +74,15 @@ def with_outliers(cloud: Floats, body: Body, rng: Generator) -> Floats:
     return moved
 
 
+def with_points_anywhere(cloud: Floats, body: Body, rng: Generator) -> Floats:
+    """A fifth of the points put anywhere in a box around the cloud, larger by a fifth to each side."""
+    moved, wrong = cloud.copy(), rng.choice(len(cloud), len(cloud) // 5, replace=False)
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    reach = 0.2 * (high - low)
+    moved[wrong] = rng.uniform(low - reach, high + reach, (len(wrong), 3))
+    return moved
+
+
 def part(share: float) -> Callable[[Floats, Body, Generator], Floats]:
     """A share of the points."""
     return lambda cloud, body, rng: cloud[rng.choice(len(cloud), int(share * len(cloud)), replace=False)]
@@ -102,6 +111,7 @@ ROWS: dict[str, tuple[Callable[[Floats, Body, Generator], Floats], bool, bool]] 
     "no zone, noise 1 mm": (noisy(1.0), False, False),
     "no zone, noise 2 mm": (noisy(2.0), False, False),
     "no zone, noise 5 mm": (noisy(5.0), False, False),
+    "no zone, a fifth anywhere": (with_points_anywhere, False, False),
 }
 
 

@@ -91,7 +91,6 @@ class Registrar:
         is_found = inputs is not None and inputs.modulus is not None
         self.modulus_deviation = 0.0 if is_found else modulus_deviation
         self.anywhere = None if anywhere is None else cache(anywhere)  # made when it is first asked for
-        self._told = expectations
 
     @property
     def model(self) -> ForwardModel:
@@ -120,20 +119,9 @@ class Registrar:
 
     def with_pose(self, pose: PosePrior) -> Registrar:
         """The same with an unknown pose."""
-        anywhere, setup = self.anywhere, self.setup
-        posed = Registrar(
-            setup.model,
-            setup.observed,
-            setup.forces,
-            self.options,
-            pose=pose,
-            expectations=self._told,
-            inputs=setup.inputs,
-            blocks=setup.blocks,
-            modulus_deviation=self.modulus_deviation,
-            anywhere=None if anywhere is None else lambda: anywhere().with_pose(pose),
-        )
-        return posed.with_terms(*setup.terms)
+        anywhere, other = self.anywhere, self._with(replace(self.setup, pose=pose))
+        other.anywhere = None if anywhere is None else cache(lambda: anywhere().with_pose(pose))
+        return other
 
     def _with(self, setup: Setup) -> Registrar:
         other = copy.copy(self)
