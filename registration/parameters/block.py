@@ -114,7 +114,11 @@ class ParameterBlock:
         return True
 
     def hyperpriors(self, observed: SurfaceDistance) -> Mapping[int, LogNormalPrior]:
-        """Hyperpriors of the scales that this block brings, by their place among `Hyperparameters`."""
+        """Hyperpriors of the scales that this block brings, by their place among the five of `Hyperparameters`.
+
+        Another scale is a field of that and of what names them one by one: `local_model.without_shared_noise`, and
+        `device.evidence`.
+        """
         return {}
 
     def log_variances(self, eta: Floats) -> tuple[Floats | float, Mapping[int, Floats | float]]:
