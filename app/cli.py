@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import sys
 import warnings
 from collections.abc import Callable
@@ -69,7 +70,7 @@ def softtwin() -> None:
     a partial point cloud how the whole organ has moved and which forces did it.
 
     Start with `softtwin quickstart`. For an organ of your own: `softtwin build liver.stl --unit mm --fixed veins.ply`,
-    then `softtwin register twin clouds/*.ply`. Research software: not a medical device.
+    then `softtwin register twin-run clouds/*.ply`. Research software: not a medical device.
     """
 
 
@@ -90,11 +91,21 @@ def config() -> None:
 @softtwin.command()
 @click.argument("configuration", type=_EXISTING)
 def mesh(configuration: Path) -> None:
-    """Make the body of CONFIGURATION: read or make a surface, fill it with tetrahedra, report the quality."""
+    """Make the body of CONFIGURATION: read or make a surface, fill it with tetrahedra, report the quality.
+
+    One that is there stays, where nothing that it was made from has changed. Another one is made beside a copy of it,
+    body.before.vtu: equilibria that were solved are of the body that they were solved on.
+    """
+    from .inputs import is_meshed
     from .stages.mesh import mesh_stage
     from .workspace import open_workspace
 
     space = open_workspace(configuration)
+    if is_meshed(space):
+        click.echo(f"nothing has changed: {space.body} stays as it is; remove it to have it made again")
+        return
+    if space.body.exists():
+        shutil.copy2(space.body, space.body.with_suffix(".before.vtu"))
     body = mesh_stage(space)
     click.echo((space.folder / "mesh_quality.txt").read_text().rstrip())
     click.echo(f"{len(body.points)} nodes, {len(body.fixed)} of them fixed; written to {space.body}")
@@ -351,10 +362,13 @@ def register(
             budget=budget, idle=idle, learn=learn, keep=keep, say=click.echo,
         )  # fmt: skip
     else:
-        verdicts = register_files(
-            twin, clouds, output, options, unit=unit, axes=frame, start=begin, truth=truth, formats=formats,
-            budget=budget, say=click.echo,
-        )  # fmt: skip
+        try:
+            verdicts = register_files(
+                twin, clouds, output, options, unit=unit, axes=frame, start=begin, truth=truth, formats=formats,
+                budget=budget, say=click.echo,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            _end(f"\ninterrupted: {output} has the frames so far; the same command begins with the first again.", 130)
     said = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items() if count)
     click.echo(f"{said or 'no frame'}; written to {output}\n{NOTICE}")
     if strict and verdicts["doubtful"] + verdicts["refused"]:

@@ -124,8 +124,13 @@ def changes(space: Workspace, stage: str, now: Mapping[str, Any]) -> list[str] |
     return [
         f"{name} ({_shown(then.get(name))} then, {_shown(now.get(name))} now)"
         for name in names
-        if then.get(name) != json.loads(json.dumps(now.get(name)))
+        if not _is_same(then.get(name), json.loads(json.dumps(now.get(name))))
     ]
+
+
+def is_meshed(space: Workspace) -> bool:
+    """Whether the body is there, made from what the configuration says today."""
+    return space.body.exists() and changes(space, "mesh", mesh_inputs(space)) == []
 
 
 def current_body(space: Workspace) -> Body:
@@ -240,6 +245,17 @@ def _content(value: Any, root: Path) -> Any:
     return [_content(item, root) for item in value] if isinstance(value, list | tuple) else value
 
 
+def _is_same(then: Any, now: Any) -> bool:
+    """Whether an entry is what it was; of a file that is not there, as on another machine, nothing else is known."""
+    if isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
+        return all(map(_is_same, then, now))
+    is_gone = str(then).startswith("sha256:") and isinstance(now, str) and not now.startswith("sha256:")
+    if is_gone and bool(now):
+        named = parse_file(now)
+        return [word for word in (named.unit, named.axes) if word] == str(then).split(":")[2:]
+    return bool(then == now)
+
+
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -249,4 +265,6 @@ def _shown(value: Any) -> str:
     if value is None:
         return "nothing"
     text = str(value)
-    return f"{text[:19]}..." if text.startswith("sha256:") else text if len(text) <= 60 else f"{text[:12]}..."
+    if text.startswith("sha256:"):
+        return ":".join(["sha256", f"{text[7:19]}...", *text.split(":")[2:]])
+    return text if len(text) <= 60 else f"{text[:12]}..."

@@ -18,7 +18,7 @@ from .config import ConfigError
 from .export import WRITTEN, Exporter
 from .landmarks import LandmarkFiles
 from .record import Recorder, counts, describe
-from .register import Scene, Start, check_any, check_budget, name_of, registered, say_coordinates
+from .register import Scene, Start, check_any, check_budget, check_output, name_of, registered, say_coordinates
 from .searching import searching
 from .sources import check_idle, opened
 from .streams import Clock, Mailbox
@@ -164,6 +164,7 @@ def watch_source(
     elif source.exists() and not source.is_dir():
         raise ConfigError(f"--watch: expected a folder, got the file {source}.")
     scene = Scene.of(place, options, unit, axes)
+    check_output(output, scene.home, [] if isinstance(source, Address) else [source])
     budget = scene.budget(budget)
     start = start or Start()
     frame_landmarks = scene.frame_landmarks(start)

@@ -159,6 +159,24 @@ def read_truth(path: Path, frames: int, body: Body, coordinates: Coordinates) ->
     return turned
 
 
+def check_output(output: Path, home: twins.Home, names: Sequence[Path | str]) -> None:
+    """Refuse to write among what is read: the next run would take results for clouds, or for a twin.
+
+    Args:
+        output: folder to write to.
+        home: of the twin.
+        names: files, folders or patterns of clouds.
+
+    Raises:
+        ConfigError: it is a folder whose clouds are all read, or the twin's.
+    """
+    wanted, read = output.resolve(), [Path(name) for name in names if not Path(name).is_file()]
+    if wanted in {(path if path.is_dir() else path.parent).resolve() for path in read}:
+        raise ConfigError(f"--output: expected a folder of its own, got {output}, in which the clouds are.")
+    if wanted == home.folder.resolve():
+        raise ConfigError(f"--output: expected a folder of its own, got {output}, in which the twin is.")
+
+
 def camera_from_matrix(path: Path, coordinates: Coordinates) -> Pose:
     """The pose in a file, between the inner axes of body and clouds.
 
@@ -226,7 +244,10 @@ def register_files(
     scene = Scene.of(place, options, unit, axes)
     clouds = find_clouds(names, scene.outside, scene.normals)
     budget = scene.budget(budget)
+    check_output(output, scene.home, names)
     positions = None if truth is None else read_truth(truth, len(clouds), scene.home.body, scene.inside)
+    if positions is not None and len(positions) > len(clouds):
+        say(f"warning: --truth has {len(positions)} frames, for {len(clouds)} clouds: the first of them are taken.")
     start = start or Start()
     frame_landmarks = scene.frame_landmarks(start, [cloud.path for cloud in clouds])
     with scene.opened(start, say) as (twin, camera):

@@ -302,12 +302,12 @@ def _iterations(data: DataSet, split: Any) -> Ints:
     return figures["iterations"][figures["reason"] == 0][:_MOST_DRAWS]
 
 
-_SPLIT_COLOURS = ("#4c78a8", "#72b7b2", "#f2a65a", "#b79ad6")
+_SPLIT_COLOURS = ("#4c78a8", "#72b7b2", "#f2a65a", "#b79ad6", "#8c8c8c", "#d67195")
 
 
 def _draw_data(sheet: Figure, peaks: Mapping[str, Floats], iterations: Mapping[str, Ints]) -> None:
     left, right = sheet.subplots(1, 2)
-    colours = _SPLIT_COLOURS[: len(peaks)]
+    colours = [_SPLIT_COLOURS[place % len(_SPLIT_COLOURS)] for place in range(len(peaks))]
     left.hist([1e3 * peaks[split] for split in peaks], bins=24, stacked=True, color=colours, label=list(peaks))
     left.set(xlabel="largest nodal displacement (mm)", ylabel="samples")
     left.legend(frameon=False)

@@ -60,6 +60,8 @@ def prepared(case: int, side: str) -> tuple[Path, float]:
     is_own = np.loadtxt(data / "landmarks_lung.txt").astype(int) == label
     for name in ("inspiration", "expiration"):
         np.savetxt(folder / f"landmarks_{name}.txt", np.loadtxt(data / f"landmarks_{name}.txt")[is_own])
+    for made in folder.rglob("body.vtu"):
+        made.unlink()
     begin = time.perf_counter()
     softtwin("mesh", folder / "organ.toml")
     return folder, time.perf_counter() - begin

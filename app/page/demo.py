@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..config import ConfigError
 from ..record import NOTICE
 from ..twin import Home, find_twin
 from .camera import AROUND_S, Shot, TrueStates, shot
@@ -35,6 +36,8 @@ def run_demo(
     Raises:
         ConfigError: the port is taken.
     """
+    if record is not None and not record.absolute().parent.is_dir():
+        raise ConfigError(f"--record: expected a file in a folder that is there, got {record}.")
     home, states = find_twin(PHANTOM), TrueStates.read(PHANTOM)
     with ExitStack() as stack:  # however early Ctrl-C comes: a thread at work when Python ends takes the process down
         server = stack.enter_context(serving(port, "softtwin demo"))

@@ -1,0 +1,66 @@
+"""What somebody met who used the program for the first time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvista
+
+from softtwin.app import inputs, report
+from softtwin.app.config import ConfigError
+from softtwin.app.page.demo import run_demo
+from softtwin.app.pictures import chart
+
+from .conftest import run
+
+
+def test_each_split_has_a_colour_however_many_there_are() -> None:
+    names = ("train", "validation", "test", "calibration", "smooth", "active", "another")
+    peaks = {name: np.linspace(0.001, 0.002, 5) for name in names}
+    iterations = {name: np.arange(1, 6) for name in names}
+    assert chart(lambda sheet: report._draw_data(sheet, peaks, iterations), "histograms")
+
+
+def test_a_body_that_nothing_has_changed_stays(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Its equilibria are of no other; and where something has, what it was is kept beside it."""
+    pyvista.Icosphere(radius=0.05, nsub=3).save(tmp_path / "ball.stl")
+    text = 'body = {source = "ball.stl", nodes = 150, fixed = "halfspace:0,0,-0.02:0,0,-1"}\n'
+    (tmp_path / "organ.toml").write_text(text)
+    run(capsys, "mesh", tmp_path / "organ.toml")
+    (body,) = tmp_path.rglob("body.vtu")
+    before = body.read_bytes()
+    assert "nothing has changed" in run(capsys, "mesh", tmp_path / "organ.toml")
+    assert body.read_bytes() == before
+    (tmp_path / "organ.toml").write_text(text.replace("150", "200"))
+    run(capsys, "mesh", tmp_path / "organ.toml")
+    assert body.read_bytes() != before and body.with_suffix(".before.vtu").read_bytes() == before
+
+
+def test_on_a_machine_without_the_surface_its_body_is_that_body() -> None:
+    """A copied folder goes on there; what is there and differs is still found."""
+    was = f"sha256:{64 * 'a'}:mm"
+    assert inputs._is_same(was, "/elsewhere/liver.stl:mm") and inputs._is_same([was, 1], ["/elsewhere/liver.stl:mm", 1])
+    for now in ("/elsewhere/liver.stl:cm", "/elsewhere/liver.stl", f"sha256:{64 * 'b'}:mm", "", None):
+        assert not inputs._is_same(was, now)
+    assert inputs._shown(was) == "sha256:aaaaaaaaaaaa...:mm"
+
+
+def test_results_are_not_written_among_what_is_read(
+    capsys: pytest.CaptureFixture[str], mesh_folder: Path, tmp_path: Path
+) -> None:
+    clouds = tmp_path / "clouds"
+    clouds.mkdir()
+    np.savetxt(clouds / "cloud.txt", 0.02 * np.random.default_rng(0).standard_normal((50, 3)))
+    for names in (clouds, f"{clouds}/*.txt"):
+        said = run(capsys, "register", mesh_folder, names, "--model", "reference", "--output", clouds, code=2)
+        assert "--output: expected a folder of its own" in said and "in which the clouds are" in said
+    said = run(capsys, "register", mesh_folder, clouds, "--model", "reference", "--output", mesh_folder, code=2)
+    assert "in which the twin is" in said
+    assert [path.name for path in clouds.iterdir()] == ["cloud.txt"]
+
+
+def test_a_recording_in_no_folder_is_refused_before_it_begins(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--record: expected a file in a folder that is there"):
+        run_demo(0, browser=False, record=tmp_path / "none" / "scene.html", seconds=1.0)
