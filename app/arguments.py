@@ -22,7 +22,7 @@ class StartArguments(Section):
 
     start: Path | None = option(
         None,
-        "4 x 4 matrix from the undeformed body to the camera (TXT CSV NPY JSON TFM)",
+        "4 x 4 matrix from the undeformed body to the camera, shift in the clouds' unit (TXT CSV NPY JSON; TFM: mm)",
         basic=True,
         exists=True,
     )

@@ -689,12 +689,14 @@ def read_config(path: Path | str) -> tuple[Config, Path]:
     """A checked configuration, and the folder that its relative paths start from.
 
     Args:
-        path: TOML file.
+        path: TOML file, or a folder with one that is called organ.toml.
 
     Raises:
         ConfigError: the file is missing, no TOML, or entries are unknown or out of range.
     """
     path = Path(path)
+    if (path / "organ.toml").is_file():
+        path = path / "organ.toml"
     if not path.is_file():
         raise ConfigError(f"configuration: expected a TOML file, found none at {path}; `softtwin config` writes one.")
     try:

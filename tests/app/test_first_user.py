@@ -9,7 +9,7 @@ import pytest
 import pyvista
 
 from softtwin.app import inputs, report
-from softtwin.app.config import ConfigError
+from softtwin.app.config import ConfigError, read_config
 from softtwin.app.page.demo import run_demo
 from softtwin.app.pictures import chart
 
@@ -64,3 +64,12 @@ def test_results_are_not_written_among_what_is_read(
 def test_a_recording_in_no_folder_is_refused_before_it_begins(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"--record: expected a file in a folder that is there"):
         run_demo(0, browser=False, record=tmp_path / "none" / "scene.html", seconds=1.0)
+
+
+def test_a_folder_stands_for_the_configuration_in_it(tmp_path: Path) -> None:
+    (tmp_path / "organ.toml").write_text("material = {young_modulus = 1234.0}\n")
+    config, root = read_config(tmp_path)
+    assert config.material.young_modulus == 1234.0 and root == tmp_path
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match=r"expected a TOML file, found none at .*empty"):
+        read_config(tmp_path / "empty")
