@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,10 +15,11 @@ from tqdm import tqdm
 from softtwin.meshes.io import Unit
 from softtwin.registration.parameters.block import Estimate
 from softtwin.registration.result import Registration
+from softtwin.registration.verdict import Verdict
 
 from .export import WRITTEN, Exporter
 from .record import Recorder, describe, describe_estimate
-from .register import Scene, Start, check_any, find_clouds, name_of, registered, say_coordinates
+from .register import Scene, Start, check_any, check_output, find_clouds, name_of, registered, say_coordinates
 from .twin import Sequence as Frames
 
 Floats = NDArray[np.float64]
@@ -49,6 +51,7 @@ def identify_files(
     """
     scene = Scene.of(place, options, unit)
     clouds, found = find_clouds(names, scene.outside, scene.normals), list[Registration]()
+    check_output(output, scene.home, names)
     with scene.opened(start or Start(), say) as (twin, camera):
         say_coordinates(twin, say)
         frames = Frames(twin, None, camera)
@@ -63,6 +66,10 @@ def identify_files(
             recorder.header["together"] = [asdict(estimate) for estimate in estimates]
     check_any(recorder.rows)
     say(f"of {len(clouds)} clouds {len(found)} could be used")
+    doubtful = [result.judgement for result in found if result.judgement.verdict is Verdict.DOUBTFUL]
+    if doubtful:
+        reasons = Counter(reason for judgement in doubtful for reason in judgement.reasons[:1])
+        say(f"warning: {len(doubtful)} of them are doubtful, and so is what follows: {reasons.most_common(1)[0][0]}")
     for estimate in estimates:
         say(describe_estimate(asdict(estimate)))
     return len(found)

@@ -56,15 +56,23 @@ class LandmarkFiles:
         body: points on the body at rest by name, (3,) each, metres.
         camera: folder of the frames' files, or the file of the only one.
         coordinates: unit and axes of these, the clouds' own.
+        option: that they were given by, for messages.
     """
 
     body: Mapping[str, Floats]
     camera: Path
     coordinates: Coordinates
+    option: str = "--frame-landmarks"
 
     @classmethod
     def read(
-        cls, body: Path, camera: Path, inside: Coordinates, clouds: Coordinates, files: Sequence[Path] | None
+        cls,
+        body: Path,
+        camera: Path,
+        inside: Coordinates,
+        clouds: Coordinates,
+        files: Sequence[Path] | None,
+        option: str = "--frame-landmarks",
     ) -> LandmarkFiles:
         """The landmarks of the body; those of each cloud that is there already are read once, too.
 
@@ -74,22 +82,23 @@ class LandmarkFiles:
             inside: coordinates of the body's files.
             clouds: of the clouds' files.
             files: of all clouds; None where they are yet to come.
+            option: as above.
 
         Raises:
             ConfigError: one file for several clouds, or a folder with none that is named like a cloud.
             FileError: a file cannot be read, or shares no name with the body's.
         """
-        found = cls(_read(body, inside), camera, clouds)
+        found = cls(_read(body, inside), camera, clouds, option)
         if not camera.is_dir() and (files is None or len(files) != 1):
             raise ConfigError(
-                f"--frame-landmarks: expected a folder with a file for each cloud, named like it, got the file "
+                f"{option}: expected a folder with a file for each cloud, named like it, got the file "
                 f"{camera} for {'clouds that are yet to come' if files is None else f'{len(files)} clouds'}."
             )
         if files is None:
             return found
         if not [file for file in files if found.of(file) is not None]:  # every file is read
             raise ConfigError(
-                f"--frame-landmarks: expected files in {camera} that are named like the clouds, such as "
+                f"{option}: expected files in {camera} that are named like the clouds, such as "
                 f"{files[0].stem}.csv ({', '.join(SUFFIXES)}), found none."
             )
         return found
@@ -107,7 +116,7 @@ class LandmarkFiles:
         try:
             LandmarkPairs.of(twin.observed, points, points)
         except ValueError as error:
-            raise ConfigError(f"--frame-landmarks: {error}") from None
+            raise ConfigError(f"{self.option}: {error}") from None
 
     def of(self, cloud: Path) -> tuple[Floats, Floats] | None:
         """Points on the body at rest and where a cloud's frame shows them, (l, 3) each, metres; None: it has no file.

@@ -115,11 +115,16 @@ def evaluate_files(
     scene = Scene.of(place, options, unit, axes)
     files = find_clouds(clouds, scene.outside, scene.normals)
     rest, moved = (_named(text, usual) for text, usual in zip(landmarks, (scene.inside, scene.outside), strict=True))
-    known = LandmarkFiles.read(rest[0], moved[0], rest[1], moved[1], [file.path for file in files])
+    known = LandmarkFiles.read(rest[0], moved[0], rest[1], moved[1], [file.path for file in files], "--landmarks")
     pairs = [(file, known.named(file.path)) for file in files]
     without = [file.path.name for file, found in pairs if found is None]
     if without:
         say(f"without landmarks, left out: {', '.join(without)}")
+    for file, found in pairs:
+        alone = [] if found is None else [name for name in known.body if name not in found[0]]
+        if alone:
+            more = f" and {len(alone) - 5} more" if len(alone) > 5 else ""
+            say(f"landmarks that {file.path.name} does not show, left out: {', '.join(alone[:5])}{more}")
     head = {
         "notice": NOTICE,
         "twin": place.resolve().name,

@@ -97,6 +97,7 @@ def test_what_is_not_told_is_said(folder: Path, tmp_path: Path) -> None:
     assert code == 0, said
     assert "doubtful (the cloud does not tell Young's modulus under this load" in said
     assert "not told by the cloud" in said
+    assert "warning: 1 of them are doubtful, and so is what follows: the cloud does not tell Young's modulus" in said
 
 
 def test_forces_and_stiffness_together_carry_the_prior(folder: Path, tmp_path: Path) -> None:

@@ -191,6 +191,19 @@ def test_what_cannot_be_compared_is_said(capsys, phantom: Path, folder: Path) ->
     assert "expected places inside the organ at rest, got 40 outside of it" in said and "unit, axes and frame" in said
 
 
+def test_landmarks_that_a_frame_does_not_show_are_named(capsys, phantom: Path, folder: Path) -> None:
+    shown = (folder / "moved" / "frame_1.csv").read_text().splitlines()
+    (folder / "moved" / "frame_1.csv").write_text("\n".join(shown[:-8]) + "\n")  # the file has the last ones first
+    said = evaluated(capsys, phantom, folder, "--start", folder / "camera.txt", "--pose", "fixed")
+    assert "landmarks that frame_1.txt does not show, left out: p0, p1, p2, p3, p4 and 3 more" in said
+    told = json.loads((folder / "out" / "evaluation.json").read_text())
+    assert told["all"]["landmarks"] == 2 * COUNT - 8
+    moved = folder / "moved" / "frame_0.csv"
+    words = ["--cloud", folder / "clouds", "--landmarks", folder / "rest.csv", moved, "--unit", "mm"]
+    said = run(capsys, "evaluate", phantom, *words, code=2)
+    assert "error: --landmarks: expected a folder with a file for each cloud" in said
+
+
 def test_figures_are_those_of_known_errors() -> None:
     """Errors drawn from their covariances lie in regions as often as these say; half as large ones more often."""
     rng = np.random.default_rng(0)
