@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from softtwin.app import inputs, report
 from softtwin.app.config import ConfigError, read_config
 from softtwin.app.page.demo import run_demo
 from softtwin.app.pictures import chart
+from softtwin.app.twin import Sequence, Twin
 
 from .conftest import run
 
@@ -73,3 +75,14 @@ def test_a_folder_stands_for_the_configuration_in_it(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match=r"expected a TOML file, found none at .*empty"):
         read_config(tmp_path / "empty")
+
+
+def test_no_answer_of_a_live_sequence_waits_for_garbage_of_what_was_loaded(plain_twin: Twin) -> None:
+    before = gc.get_freeze_count()
+    sequence = Sequence(plain_twin, is_live=True)
+    assert gc.get_freeze_count() > before + 1000
+    sequence.close()
+    assert gc.get_freeze_count() == 0
+    still = Sequence(plain_twin)
+    assert gc.get_freeze_count() == 0
+    still.close()
