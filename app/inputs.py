@@ -124,7 +124,7 @@ def changes(space: Workspace, stage: str, now: Mapping[str, Any]) -> list[str] |
     return [
         f"{name} ({_shown(then.get(name))} then, {_shown(now.get(name))} now)"
         for name in names
-        if not _is_same(then.get(name), json.loads(json.dumps(now.get(name))))
+        if then.get(name) != json.loads(json.dumps(now.get(name)))
     ]
 
 
@@ -243,17 +243,6 @@ def _content(value: Any, root: Path) -> Any:
             behind = "".join(f":{word}" for word in (named.unit, named.axes) if word)
             return f"sha256:{_sha256(root / named.path)}{behind}"
     return [_content(item, root) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _is_same(then: Any, now: Any) -> bool:
-    """Whether an entry is what it was; of a file that is not there, as on another machine, nothing else is known."""
-    if isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
-        return all(map(_is_same, then, now))
-    is_gone = str(then).startswith("sha256:") and isinstance(now, str) and not now.startswith("sha256:")
-    if is_gone and bool(now):
-        named = parse_file(now)
-        return [word for word in (named.unit, named.axes) if word] == str(then).split(":")[2:]
-    return bool(then == now)
 
 
 def _sha256(path: Path) -> str:
