@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import sys
 import warnings
 from collections.abc import Callable
@@ -94,9 +93,9 @@ def mesh(configuration: Path) -> None:
     """Make the body of CONFIGURATION: read or make a surface, fill it with tetrahedra, report the quality.
 
     One that is there stays, where nothing that it was made from has changed. Another one is made beside a copy of it,
-    body.before.vtu: equilibria that were solved are of the body that they were solved on.
+    body.HASH.vtu: equilibria that were solved are of the body that they were solved on.
     """
-    from .inputs import is_meshed
+    from .inputs import is_meshed, set_aside
     from .stages.mesh import mesh_stage
     from .workspace import open_workspace
 
@@ -105,7 +104,7 @@ def mesh(configuration: Path) -> None:
         click.echo(f"nothing has changed: {space.body} stays as it is; remove it to have it made again")
         return
     if space.body.exists():
-        shutil.copy2(space.body, space.body.with_suffix(".before.vtu"))
+        set_aside(space)
     body = mesh_stage(space)
     click.echo((space.folder / "mesh_quality.txt").read_text().rstrip())
     click.echo(f"{len(body.points)} nodes, {len(body.fixed)} of them fixed; written to {space.body}")

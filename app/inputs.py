@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -131,6 +132,11 @@ def changes(space: Workspace, stage: str, now: Mapping[str, Any]) -> list[str] |
 def is_meshed(space: Workspace) -> bool:
     """Whether the body is there, made from what the configuration says today."""
     return space.body.exists() and changes(space, "mesh", mesh_inputs(space)) == []
+
+
+def set_aside(space: Workspace) -> None:
+    """Copy the body under a name by its content, so that no later copy takes its place."""
+    shutil.copy2(space.body, space.body.with_suffix(f".{_sha256(space.body)[:8]}.vtu"))
 
 
 def current_body(space: Workspace) -> Body:
